@@ -1,0 +1,12 @@
+"""Rooms as graphs of photographed poses: what the world is.
+
+>>> from vusfa.scenes import SceneSet
+>>> SceneSet.bundled()
+SceneSet(bathroom: 176, bedroom: 404, kitchen: 680, living_room: 452)
+"""
+
+from vusfa.scenes.scene import Scene
+from vusfa.scenes.scene_set import SceneSet
+from vusfa.scenes.store import bundled_names, validate
+
+__all__ = ["Scene", "SceneSet", "bundled_names", "validate"]

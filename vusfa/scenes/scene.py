@@ -1,0 +1,234 @@
+"""One scene: a room as a finite graph of photographed poses.
+
+A state is a pose (a place and a heading) with its picture's features; an action leads to another state or is
+blocked. Nothing of an open file is kept: a scene can be pickled, forked and spawned. Pictures are read from the
+file when they are asked for.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from vusfa.errors import SceneError
+from vusfa.scenes import store
+from vusfa.scenes.faults import array_faults
+from vusfa.scenes.graph import shortest_path_distances, weak_components
+
+__all__ = ["Scene"]
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """A room: its graph, its pictures' features, its poses. All tensors are on the CPU.
+
+    Built from tensors or arrays, which are checked and converted; or read by :meth:`load` and :meth:`bundled`.
+
+    Args:
+        name: what the scene is called.
+        graph: (N, A) integers, next state, -1 = blocked.
+        features: (N, C, F) floats, C crops (augmented views) of F features; kept as float32.
+        location: (N, 2) metres; zeros when not given.
+        rotation: (N,) degrees; zeros when not given.
+        distance: (N, N) integers, ``[s, g]`` actions from s to g, -1 = unreachable; computed when not given, and
+            checked against a breadth-first search when given.
+        actions: A names; the THOR v1 dumps' four when not given and A is 4.
+        attributes: provenance: str, int, float, or lists of these.
+        path: the file that pictures are read from; None for a scene in memory.
+        picture_shape: (H, W, 3) of the pictures in that file; None without pictures.
+
+    Raises:
+        SceneError: something does not fit; the message lists every fault.
+
+    >>> corridor = Scene("corridor", graph=torch.tensor([[1, -1], [2, 0], [-1, 1]]), features=torch.rand(3, 1, 8))
+    >>> corridor.distance.tolist()
+    [[0, 1, 2], [1, 0, 1], [2, 1, 0]]
+    >>> Scene("broken", graph=torch.tensor([[1, -1], [5, 0]]), features=torch.rand(2, 1, 8))
+    Traceback (most recent call last):
+    ...
+    vusfa.errors.SceneError: scene 'broken': dataset 'graph', state 1: action 0 leads to 5, but the states are ...
+    """
+
+    name: str
+    graph: Tensor
+    features: Tensor = field(repr=False)
+    location: Tensor = field(default=None, repr=False)  # type: ignore[assignment]
+    rotation: Tensor = field(default=None, repr=False)  # type: ignore[assignment]
+    distance: Tensor = field(default=None, repr=False)  # type: ignore[assignment]
+    actions: tuple[str, ...] = None  # type: ignore[assignment]
+    attributes: dict[str, Any] = field(default_factory=dict, repr=False)
+    path: Path | None = None
+    picture_shape: tuple[int, int, int] | None = None
+
+    def __post_init__(self) -> None:
+        source = str(self.path) if self.path is not None else f"scene {self.name!r}"
+        arrays = {
+            "graph": _numpy(self.graph),
+            "resnet_feature": _numpy(self.features),
+        }
+        num_states = arrays["graph"].shape[0] if arrays["graph"].ndim else 0
+        location, rotation = (_numpy(self.location), _numpy(self.rotation))
+        arrays["location"] = np.zeros((num_states, 2), np.float32) if self.location is None else location
+        arrays["rotation"] = np.zeros(num_states, np.float32) if self.rotation is None else rotation
+        given = None if self.distance is None else _numpy(self.distance)
+        # Until the graph is known to be sound no search can run on it; the diagonal's zeros stand in for the check.
+        arrays["shortest_path_distance"] = (
+            np.zeros((num_states, num_states), np.int16) if given is None else given
+        )
+        actions = None if self.actions is None else tuple(self.actions)
+        faults = array_faults(arrays, actions)
+        if given is None:
+            faults = [fault for fault in faults if "shortest_path_distance" not in fault]
+        store.raise_faults(source, faults)
+        distance = shortest_path_distances(arrays["graph"])
+        values = {
+            "graph": torch.tensor(arrays["graph"].astype(np.int64)),
+            "features": torch.tensor(arrays["resnet_feature"].astype(np.float32)),
+            "location": torch.tensor(arrays["location"].astype(np.float32)),
+            "rotation": torch.tensor(arrays["rotation"].astype(np.float32)),
+            "distance": distance,
+            "actions": actions or store.default_actions(arrays["graph"].shape[1]),
+            "attributes": dict(self.attributes),
+            "path": None if self.path is None else Path(self.path).resolve(),
+        }
+        for key, value in values.items():
+            object.__setattr__(self, key, value)
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str]) -> Scene:
+        """Read and check a scene file; the file is closed again when this returns.
+
+        Raises:
+            SceneError: the file is missing, truncated or has faults; the message lists every one of them.
+        """
+        dump = store.read(path)
+        store.raise_faults(path, dump.faults)
+        return cls(
+            name=dump.name,
+            graph=dump.arrays["graph"],
+            features=dump.arrays["resnet_feature"],
+            location=dump.arrays["location"],
+            rotation=dump.arrays["rotation"],
+            distance=dump.arrays["shortest_path_distance"],
+            actions=dump.actions,
+            attributes=dump.attributes,
+            path=Path(path),
+            picture_shape=dump.picture_shape,
+        )
+
+    @classmethod
+    def bundled(cls, name: str) -> Scene:
+        """One of the rooms that come with the package.
+
+        >>> room = Scene.bundled("bathroom")
+        >>> room.num_states, room.num_actions, room.num_crops, room.feature_size, room.islands
+        (176, 4, 1, 1280, ())
+        >>> room.pictures([3, 0]).shape
+        torch.Size([2, 150, 200, 3])
+        """
+        return cls.load(store.bundled_path(name))
+
+    def save(
+        self, path: str | os.PathLike[str], pictures: Tensor | np.ndarray | Sequence[bytes] | None = None
+    ) -> None:
+        """Write the scene, atomically; what is read back is equal, number for number.
+
+        Args:
+            path: where to; replaced if it exists.
+            pictures: (N, H, W, 3) uint8, or N JPEG files as bytes; None copies those that the scene has, as they are.
+
+        Raises:
+            SceneError: the pictures do not fit, an attribute cannot be written, or the folder does not exist.
+        """
+        if isinstance(pictures, Tensor):
+            pictures = pictures.cpu().numpy()
+        if pictures is not None and len(pictures) != self.num_states:
+            raise SceneError(
+                f"scene {self.name!r}: {len(pictures)} pictures for {self.num_states} states; give each one"
+            )
+        if isinstance(pictures, np.ndarray) and (
+            pictures.dtype != np.uint8 or pictures.ndim != 4 or pictures.shape[3] != 3
+        ):
+            raise SceneError(
+                f"scene {self.name!r}: pictures are {pictures.dtype} {pictures.shape}; give uint8 (N, H, W, 3)"
+            )
+        store.write(
+            path,
+            {
+                "graph": self.graph.numpy(),
+                "resnet_feature": self.features.numpy(),
+                "location": self.location.numpy(),
+                "rotation": self.rotation.numpy(),
+                "shortest_path_distance": self.distance.numpy(),
+            },
+            name=self.name,
+            actions=self.actions,
+            attributes=self.attributes,
+            pictures=self.path if pictures is None and self.has_pictures else pictures,
+        )
+
+    def pictures(self, ids: Any) -> Tensor:
+        """Pictures of some states, read from the scene's file now; the file is closed again.
+
+        Args:
+            ids: state ids of any shape, in any order, repeats allowed.
+
+        Returns:
+            (*ids.shape, H, W, 3) uint8.
+
+        Raises:
+            SceneError: the scene has no pictures, the file is gone, or a state is out of range.
+        """
+        if self.path is None or not self.has_pictures:
+            raise SceneError(
+                f"scene {self.name!r} has no pictures; load it from a file with dataset 'observation'"
+            )
+        states = torch.as_tensor(ids, dtype=torch.int64).cpu()
+        found = torch.from_numpy(store.read_pictures(self.path, states.reshape(-1).numpy()))
+        return found.reshape(*states.shape, *found.shape[1:])
+
+    @property
+    def has_pictures(self) -> bool:
+        """Whether :meth:`pictures` can give any."""
+        return self.picture_shape is not None
+
+    @property
+    def num_states(self) -> int:
+        """N."""
+        return self.graph.shape[0]
+
+    @property
+    def num_actions(self) -> int:
+        """A."""
+        return self.graph.shape[1]
+
+    @property
+    def num_crops(self) -> int:
+        """C."""
+        return self.features.shape[1]
+
+    @property
+    def feature_size(self) -> int:
+        """F."""
+        return self.features.shape[2]
+
+    @cached_property
+    def islands(self) -> tuple[tuple[int, ...], ...]:
+        """States cut off from the largest connected part, one sorted tuple an island; empty when there is none.
+
+        >>> Scene("two parts", torch.tensor([[1], [0], [0], [3]]), torch.rand(4, 1, 2)).islands
+        ((3,),)
+        """
+        return weak_components(self.graph)[1:]
+
+
+def _numpy(values: Any) -> np.ndarray:
+    return values.detach().cpu().numpy() if isinstance(values, Tensor) else np.asarray(values)

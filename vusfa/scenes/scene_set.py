@@ -1,0 +1,305 @@
+"""Several scenes as one space of state ids.
+
+A set numbers the states of its scenes through: scene i has the ids ``offsets[i] .. offsets[i + 1] - 1``. Whoever
+works with a set (environments, networks) holds integers and looks the rest up here.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from vusfa.errors import SceneError
+from vusfa.scenes.graph import successor_table
+from vusfa.scenes.scene import Scene
+from vusfa.scenes.store import bundled_names
+
+__all__ = ["SceneSet"]
+
+
+class SceneSet:
+    """Several scenes with the same actions, crops and feature size, as one global index space of S states.
+
+    Args:
+        scenes: the scenes, in the order of their ids. Names must differ.
+
+    Attributes:
+        scenes: tuple of :class:`Scene`, always on the CPU.
+        offsets: (n_scenes + 1,) int64, first global id of each scene, and S.
+        successor: (S, A) int64 global ids; a blocked move stays in place.
+        blocked: (S, A) bool.
+        features: (S, C, F) float32.
+        scene_id: (S,) int64, index of the scene.
+        location: (S, 2) float32, metres, each scene in its own frame.
+        rotation: (S,) float32, degrees.
+
+    Raises:
+        SceneError: no scenes, two of one name, or scenes that differ in actions, crops or feature size.
+
+    >>> rooms = SceneSet.bundled(["bathroom", "kitchen"])
+    >>> rooms.num_scenes, rooms.num_states, rooms.offsets.tolist()
+    (2, 856, [0, 176, 856])
+    >>> rooms.distance(torch.tensor([0, 0]), torch.tensor([0, 176])).tolist()  # itself; another room
+    [0, -1]
+    """
+
+    def __init__(self, scenes: Iterable[Scene]) -> None:
+        self.scenes: tuple[Scene, ...] = tuple(scenes)
+        _check_alike(self.scenes)
+        self._build()
+
+    def _build(self) -> None:
+        sizes = torch.tensor([scene.num_states for scene in self.scenes])
+        self.offsets = torch.cat([torch.zeros(1, dtype=torch.int64), sizes.cumsum(0)])
+        tables = [successor_table(scene.graph) for scene in self.scenes]
+        self.successor = torch.cat(
+            [t + first for (t, _), first in zip(tables, self.offsets.tolist(), strict=False)]
+        )
+        self.blocked = torch.cat([blocked for _, blocked in tables])
+        self.features = torch.cat([scene.features for scene in self.scenes])
+        self.location = torch.cat([scene.location for scene in self.scenes])
+        self.rotation = torch.cat([scene.rotation for scene in self.scenes])
+        self.scene_id = torch.repeat_interleave(torch.arange(len(self.scenes)), sizes)
+        # One row-major N x N table after the other; S x S would be mostly "another scene".
+        dtype = max((scene.distance.dtype for scene in self.scenes), key=lambda d: d.itemsize)
+        self._distance = torch.cat([scene.distance.to(dtype).flatten() for scene in self.scenes])
+        self._distance_start = torch.cat([torch.zeros(1, dtype=torch.int64), (sizes * sizes).cumsum(0)])
+
+    @classmethod
+    def bundled(cls, names: Sequence[str] | None = None) -> SceneSet:
+        """The rooms that come with the package, or some of them.
+
+        >>> SceneSet.bundled().names
+        ('bathroom', 'bedroom', 'kitchen', 'living_room')
+        """
+        return cls(Scene.bundled(name) for name in (bundled_names() if names is None else _listed(names)))
+
+    @classmethod
+    def open(cls, scenes: str | os.PathLike[str] | Sequence[str | os.PathLike[str]]) -> SceneSet:
+        """Bundled names and files alike: ``SceneSet.open(["bathroom", "my_room.h5"])``.
+
+        A bare word is a bundled name; whatever has a suffix or a folder in it is a file.
+
+        Raises:
+            SceneError: neither a bundled name nor a file, or a file with faults.
+
+        >>> SceneSet.open("kitchen").num_states
+        680
+        """
+        return cls(_open_one(scene) for scene in _listed(scenes))
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The scenes' names, in the order of their ids."""
+        return tuple(scene.name for scene in self.scenes)
+
+    @property
+    def num_scenes(self) -> int:
+        """How many scenes there are."""
+        return len(self.scenes)
+
+    @property
+    def num_states(self) -> int:
+        """S, the states of all scenes together."""
+        return self.successor.shape[0]
+
+    @property
+    def num_actions(self) -> int:
+        """A."""
+        return self.successor.shape[1]
+
+    @property
+    def actions(self) -> tuple[str, ...]:
+        """Names of the A actions."""
+        return self.scenes[0].actions
+
+    @property
+    def num_crops(self) -> int:
+        """C."""
+        return self.features.shape[1]
+
+    @property
+    def feature_size(self) -> int:
+        """F."""
+        return self.features.shape[2]
+
+    @property
+    def device(self) -> torch.device:
+        """Where the tables are."""
+        return self.successor.device
+
+    def distance(self, state: Any, goal: Any) -> Tensor:
+        """Fewest actions from states to goals.
+
+        Args:
+            state: global ids of any shape.
+            goal: global ids of a shape that broadcasts with it.
+
+        Returns:
+            int64 of the broadcast shape; -1 where the goal is unreachable or in another scene.
+        """
+        state = torch.as_tensor(state, dtype=torch.int64, device=self.device)
+        goal = torch.as_tensor(goal, dtype=torch.int64, device=self.device)
+        scene = self.scene_id[state]
+        first, size = self.offsets[scene], self.offsets[scene + 1] - self.offsets[scene]
+        same = scene == self.scene_id[goal]
+        # Where the scenes differ the sum below could lie outside the table: look up entry 0 and drop the answer.
+        place = self._distance_start[scene] + (state - first) * size + (goal - first)
+        found = self._distance[torch.where(same, place, 0)].to(torch.int64)
+        return torch.where(same, found, -1)
+
+    def scene_index(self, scene: str | int) -> int:
+        """Index of a scene by its name (or its index, which is checked).
+
+        Raises:
+            SceneError: there is no such scene.
+        """
+        if isinstance(scene, str):
+            if scene not in self.names:
+                raise SceneError(f"no scene is called {scene!r}; this set has {', '.join(self.names)}")
+            return self.names.index(scene)
+        if not 0 <= scene < self.num_scenes:
+            raise SceneError(f"there is no scene {scene}; this set has the scenes 0..{self.num_scenes - 1}")
+        return int(scene)
+
+    def global_id(self, scene: str | int, local: Any) -> Tensor:
+        """Global ids of a scene's own state ids.
+
+        Args:
+            scene: name or index.
+            local: state ids of any shape, as in the scene's file.
+
+        Raises:
+            SceneError: there is no such scene or state.
+
+        >>> SceneSet.bundled().global_id("bedroom", [0, 3]).tolist()
+        [176, 179]
+        """
+        index = self.scene_index(scene)
+        ids = torch.as_tensor(local, dtype=torch.int64, device=self.device)
+        num_states = self.scenes[index].num_states
+        wrong = ids[(ids < 0) | (ids >= num_states)]
+        if wrong.numel():
+            raise SceneError(
+                f"scene {self.names[index]!r} has no state {int(wrong[0])}; its states are 0..{num_states - 1}"
+            )
+        return ids + self.offsets[index]
+
+    def local_id(self, ids: Any) -> Tensor:
+        """The scenes' own ids of global ids of any shape; the inverse of :meth:`global_id`.
+
+        >>> SceneSet.bundled().local_id([0, 176, 179]).tolist()
+        [0, 0, 3]
+        """
+        ids = torch.as_tensor(ids, dtype=torch.int64, device=self.device)
+        return ids - self.offsets[self.scene_id[ids]]
+
+    def pictures(self, ids: Any) -> Tensor:
+        """Pictures of states by global id, read from the scenes' files now.
+
+        Args:
+            ids: global ids of any shape.
+
+        Returns:
+            (*ids.shape, H, W, 3) uint8 on the CPU.
+
+        Raises:
+            SceneError: a scene has no pictures, or the scenes' pictures differ in size.
+        """
+        ids = torch.as_tensor(ids, dtype=torch.int64).cpu()
+        flat = ids.reshape(-1)
+        scene = self.scene_id.cpu()[flat]
+        involved = scene.unique().tolist()
+        shapes = {self.scenes[index].name: self.scenes[index].picture_shape for index in involved}
+        if len(set(shapes.values())) > 1:
+            raise SceneError(
+                f"pictures of different sizes cannot be given as one tensor: {shapes}; ask scene by scene"
+            )
+        local = self.local_id(flat.to(self.device)).cpu()
+        shape = self.scenes[involved[0] if involved else 0].picture_shape or (0, 0, 3)
+        result = torch.empty(len(flat), *shape, dtype=torch.uint8)
+        for index in involved:
+            rows = scene == index
+            result[rows] = self.scenes[index].pictures(local[rows])
+        return result.reshape(*ids.shape, *shape)
+
+    def to(self, device: torch.device | str) -> SceneSet:
+        """The same set with its tables on a device; the scenes themselves stay on the CPU."""
+        moved = object.__new__(SceneSet)
+        moved.__dict__.update(
+            {k: v.to(device) if isinstance(v, Tensor) else v for k, v in self.__dict__.items()}
+        )
+        return moved
+
+    @property
+    def fingerprint(self) -> str:
+        """Sixteen hexadecimal digits that change with any name, graph or feature; the same on every machine.
+
+        >>> SceneSet.bundled(["bathroom"]).fingerprint == SceneSet.open("bathroom").fingerprint
+        True
+        """
+        if "_fingerprint" not in self.__dict__:
+            digest = hashlib.sha256()
+            for scene in self.scenes:
+                head = (scene.name, scene.actions, tuple(scene.graph.shape), tuple(scene.features.shape))
+                digest.update(repr(head).encode())
+                digest.update(scene.graph.numpy().astype("<i8").tobytes())
+                digest.update(scene.features.numpy().astype("<f4").tobytes())
+            self._fingerprint = digest.hexdigest()[:16]
+        return self._fingerprint
+
+    def __getstate__(self) -> dict[str, Any]:
+        # The tables repeat what the scenes hold: send the scenes alone, build the tables again.
+        return {"scenes": self.scenes, "device": str(self.device)}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.scenes = state["scenes"]
+        self._build()
+        self.__dict__.update(self.to(state["device"]).__dict__)
+
+    def __repr__(self) -> str:
+        return f"SceneSet({', '.join(f'{scene.name}: {scene.num_states}' for scene in self.scenes)})"
+
+
+def _listed(scenes: Any) -> list[Any]:
+    return [scenes] if isinstance(scenes, str | os.PathLike) else list(scenes)
+
+
+def _open_one(scene: str | os.PathLike[str]) -> Scene:
+    if isinstance(scene, str) and not Path(scene).suffix and os.sep not in scene:
+        if scene in bundled_names():
+            return Scene.bundled(scene)
+        if not Path(scene).is_file():
+            raise SceneError(
+                f"{scene!r} is neither a bundled scene ({', '.join(bundled_names())}) nor a file; check the name"
+            )
+    return Scene.load(scene)
+
+
+def _check_alike(scenes: Sequence[Scene]) -> None:
+    if not scenes:
+        raise SceneError(f"a SceneSet needs at least one scene; bundled are {', '.join(bundled_names())}")
+    names = [scene.name for scene in scenes]
+    for name in names:
+        if names.count(name) > 1:
+            raise SceneError(
+                f"{names.count(name)} scenes are called {name!r}; rename all but one (attribute 'scene')"
+            )
+    first = scenes[0]
+    for scene in scenes[1:]:
+        for what, of_first, of_this in (
+            ("actions", first.actions, scene.actions),
+            ("crops", first.num_crops, scene.num_crops),
+            ("feature size", first.feature_size, scene.feature_size),
+        ):
+            if of_first != of_this:
+                raise SceneError(
+                    f"scenes {first.name!r} and {scene.name!r} differ in {what} ({of_first}, {of_this});"
+                    f" put them in different sets"
+                )
