@@ -134,6 +134,15 @@ class SceneSet:
         """Where the tables are."""
         return self.successor.device
 
+    @property
+    def distance_tables(self) -> tuple[Tensor, Tensor]:
+        """The scenes' N x N tables of shortest paths, row by row and one after the other, for whoever looks up often.
+
+        Entry ``first[i] + s * N + g`` of the first tensor holds the actions from s to g, both in scene i's own ids; the
+        second tensor is ``first``, (n_scenes + 1,). Shared with the set, not copied.
+        """
+        return self._distance, self._distance_start
+
     def distance(self, state: Any, goal: Any) -> Tensor:
         """Fewest actions from states to goals.
 
