@@ -1,0 +1,369 @@
+r"""What universal successor features are trained towards, as pure functions of tensors.
+
+A value function is the expected discounted sum of rewards to come; successor features are the same sum with a
+vector, the embedding of the states to come, in the reward's place (Dayan 1993; Barreto et al., 2017,
+https://arxiv.org/abs/1606.05312; Borsa et al., 2018, https://arxiv.org/abs/1812.07626). One backward
+recursion therefore serves both: here it is written for a *cumulant* of any number of features, and the
+estimator concatenates reward and embedding to run it once.
+
+Time. A transition at step ``t`` goes from ``s_t`` to ``s_{t+1}``. ``cumulant``, ``next_value``, ``done`` and
+``terminated`` are all indexed by ``t`` and speak of the transition's end: ``next_value[t]`` is the estimate
+at ``s_{t+1}``, *before* any reset. ``done[t]`` says that the episode ended there, ``terminated[t]`` that
+nothing follows (the goal is reached) as opposed to a time-out, beyond which the value goes on. The time
+dimension is the second from last, ``(*batch, T, features)``, unless ``time_dim`` says otherwise.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+__all__ = [
+    "dual_ascent",
+    "explained_variance",
+    "gaussian_kl",
+    "information_bottleneck",
+    "lambda_return",
+    "n_step_return",
+    "policy_gradient_loss",
+    "successor_loss",
+    "successor_return",
+]
+
+
+def lambda_return(
+    cumulant: Tensor,
+    next_value: Tensor,
+    gamma: float | Tensor,
+    lmbda: float | Tensor,
+    done: Tensor,
+    terminated: Tensor,
+    *,
+    time_dim: int = -2,
+) -> Tensor:
+    r"""Lambda returns of a scalar or of a vector, cut where episodes end.
+
+    .. math::
+        G_t = c_t + \gamma \left[(1 - \lambda) v(s_{t+1}) + \lambda G_{t+1}\right]
+
+    (Sutton and Barto, 2018, Eq. 12.18). The bracket is 0 where the step terminated, and ``v(s_{t+1})`` where
+    the episode timed out or the rollout ends. ``lmbda=1`` gives the n-step return up to the rollout's end,
+    ``lmbda=0`` the one-step target.
+
+    Args:
+        cumulant: ``(*batch, T, F)``, what is summed: the reward (F = 1) or an embedding.
+        next_value: ``(*batch, T, F)``, the estimate of the sum at ``s_{t+1}``.
+        gamma: discount per step.
+        lmbda: weight of the longer return, in [0, 1].
+        done: ``(*batch, T, 1)`` or ``(*batch, T, F)``, bool: the episode ended with this step.
+        terminated: as ``done``: the episode ended and nothing follows.
+        time_dim: the dimension of time; counted from the right so that batches of any rank fit.
+
+    Returns:
+        ``(*batch, T, F)``.
+
+    Raises:
+        ValueError: when shapes do not fit each other.
+
+    Two steps, a time-out in between; then the same steps, but the first one ends at a terminal:
+
+    >>> reward, next_value = torch.tensor([[1.0], [2.0]]), torch.tensor([[10.0], [20.0]])
+    >>> done = torch.tensor([[True], [False]])
+    >>> lambda_return(reward, next_value, 0.5, 1.0, done, torch.zeros_like(done)).squeeze(-1)
+    tensor([ 6., 12.])
+    >>> lambda_return(reward, next_value, 0.5, 1.0, done, done).squeeze(-1)
+    tensor([ 1., 12.])
+    """
+    _assert_transitions(cumulant, next_value, done, terminated, time_dim)
+    bootstrap = torch.where(terminated, 0.0, next_value)
+    cumulants, bootstraps, dones = (x.unbind(time_dim) for x in (cumulant, bootstrap, done))
+    value = bootstraps[-1]
+    returns = []
+    for cumulant_t, bootstrap_t, done_t in zip(
+        reversed(cumulants), reversed(bootstraps), reversed(dones), strict=True
+    ):
+        # where the episode ended, the return of the step after it belongs to another episode
+        value = torch.where(done_t, bootstrap_t, torch.lerp(bootstrap_t, value, lmbda))
+        value = cumulant_t + gamma * value
+        returns.append(value)
+    return torch.stack(returns[::-1], time_dim)
+
+
+def n_step_return(
+    cumulant: Tensor,
+    next_value: Tensor,
+    gamma: float | Tensor,
+    n: int,
+    done: Tensor,
+    terminated: Tensor,
+    *,
+    time_dim: int = -2,
+) -> Tensor:
+    r"""Returns over at most ``n`` steps, each bootstrapped where it stops.
+
+    .. math::
+        G^{(n)}_t = \sum_{k=0}^{m-1} \gamma^k c_{t+k} + \gamma^m v(s_{t+m}), \qquad m \le n
+
+    ``m`` is smaller than ``n`` where the episode or the rollout ends first; beyond a terminal the second term
+    is 0.
+
+    Args:
+        cumulant: ``(*batch, T, F)``.
+        next_value: ``(*batch, T, F)``, the estimate at ``s_{t+1}``.
+        gamma: discount per step.
+        n: steps, at least 1. From ``T`` on it equals :func:`lambda_return` with ``lmbda=1``.
+        done: ``(*batch, T, 1)`` or ``(*batch, T, F)``, bool.
+        terminated: as ``done``.
+        time_dim: the dimension of time.
+
+    Returns:
+        ``(*batch, T, F)``.
+
+    Raises:
+        ValueError: when ``n`` is smaller than 1 or shapes do not fit each other.
+
+    >>> reward, next_value = torch.ones(4, 1), torch.full((4, 1), 8.0)
+    >>> no = torch.zeros(4, 1, dtype=torch.bool)
+    >>> n_step_return(reward, next_value, 0.5, 2, no, no).squeeze(-1)
+    tensor([3.5000, 3.5000, 3.5000, 5.0000])
+    """
+    _assert_transitions(cumulant, next_value, done, terminated, time_dim)
+    if n < 1:
+        raise ValueError(f"n_step_return: n is {n}; give at least 1")
+    steps = cumulant.shape[time_dim]
+    bootstrap = torch.where(terminated, 0.0, next_value)
+    value = bootstrap
+    returns = cumulant + gamma * value
+    for _ in range(min(n, steps) - 1):
+        # the (k+1)-step return of t holds the k-step return of t+1, unless something ended in between
+        later = torch.cat(
+            [returns.narrow(time_dim, 1, steps - 1), bootstrap.narrow(time_dim, steps - 1, 1)], time_dim
+        )
+        returns = cumulant + gamma * torch.where(done, bootstrap, later)
+    return returns
+
+
+def successor_return(
+    next_embedding: Tensor,
+    next_successor: Tensor,
+    gamma: float | Tensor,
+    done: Tensor,
+    terminated: Tensor,
+    lmbda: float | Tensor = 1.0,
+    *,
+    time_dim: int = -2,
+) -> Tensor:
+    r"""Targets of the successor features psi: the discounted embeddings phi of the states to come.
+
+    .. math::
+        \Psi_t = \phi(s_{t+1}) + \gamma \left[(1 - \lambda) \psi(s_{t+1}, g) + \lambda \Psi_{t+1}\right]
+
+    VUSFA (https://arxiv.org/abs/1908.06376) Eq. 4, as its released code has it (its Algorithm 1, line 17,
+    differs by a slip). The bracket is 0 beyond a terminal; psi of the next state stands in for the rest at
+    time-outs and at the rollout's end.
+
+    Args:
+        next_embedding: ``(*batch, T, E)``, phi of the states that the steps lead to. Not differentiated by
+            the caller.
+        next_successor: ``(*batch, T, E)``, psi of those states.
+        gamma: discount per step.
+        done: ``(*batch, T, 1)``, bool: the episode ended with this step.
+        terminated: ``(*batch, T, 1)``, bool: it ended and nothing follows.
+        lmbda: weight of the longer return; 1 is the n-step target up to the rollout's end.
+        time_dim: the dimension of time.
+
+    Returns:
+        ``(*batch, T, E)``.
+
+    Raises:
+        ValueError: when shapes do not fit each other.
+
+    >>> phi = torch.tensor([[1.0, 0.0], [0.0, 1.0]])
+    >>> psi = torch.full((2, 2), 4.0)
+    >>> no = torch.zeros(2, 1, dtype=torch.bool)
+    >>> successor_return(phi, psi, 0.5, no, no)
+    tensor([[2.0000, 1.5000],
+            [2.0000, 3.0000]])
+    """
+    return lambda_return(next_embedding, next_successor, gamma, lmbda, done, terminated, time_dim=time_dim)
+
+
+def successor_loss(successor: Tensor, target: Tensor) -> Tensor:
+    r"""Squared error of the successor features, one number a step: the mean over the E features.
+
+    Args:
+        successor: psi, ``(*batch, E)``.
+        target: ``(*batch, E)``; taken as a constant.
+
+    Returns:
+        ``(*batch)``.
+
+    Raises:
+        ValueError: when the shapes differ.
+
+    >>> successor_loss(torch.tensor([[1.0, 2.0]]), torch.tensor([[0.0, 4.0]]))
+    tensor([2.5000])
+    """
+    _assert_same_shape(successor_loss, successor=successor, target=target)
+    return (target.detach() - successor).square().mean(-1)
+
+
+def policy_gradient_loss(log_prob: Tensor, advantage: Tensor) -> Tensor:
+    r"""The policy gradient's surrogate, :math:`-\log \pi(a_t | s_t, g) A_t`, one number a step.
+
+    Args:
+        log_prob: ``(*batch)``, of the actions taken.
+        advantage: ``(*batch)``; taken as a constant.
+
+    Returns:
+        ``(*batch)``.
+
+    Raises:
+        ValueError: when the shapes differ.
+
+    >>> policy_gradient_loss(torch.tensor([-0.5]), torch.tensor([3.0]))
+    tensor([1.5000])
+    """
+    _assert_same_shape(policy_gradient_loss, log_prob=log_prob, advantage=advantage)
+    return -log_prob * advantage.detach()
+
+
+def gaussian_kl(loc: Tensor, scale: Tensor, eps: float = 1e-8) -> Tensor:
+    r"""Divergence of N(loc, scale^2) from N(0, 1), elementwise, in nats.
+
+    .. math::
+        \tfrac12 \left(\mu^2 + \sigma^2 - \log(\sigma^2 + \epsilon) - 1\right)
+
+    Only the scale's square counts, so that a network's plain linear output, of either sign, may be the scale.
+
+    Args:
+        loc: mean, any shape.
+        scale: standard deviation, the same shape.
+        eps: keeps the logarithm finite at scale 0.
+
+    Returns:
+        the shape of ``loc``.
+
+    Raises:
+        ValueError: when the shapes differ.
+
+    >>> gaussian_kl(torch.tensor([0.0, 2.0]), torch.tensor([1.0, -1.0]))
+    tensor([0., 2.])
+    """
+    _assert_same_shape(gaussian_kl, loc=loc, scale=scale)
+    variance = scale.square()
+    return 0.5 * (loc.square() + variance - torch.log(variance + eps) - 1.0)
+
+
+def information_bottleneck(kl: Tensor, beta: float | Tensor, information_target: float | Tensor) -> Tensor:
+    r"""The Lagrangian term of the information constraint, :math:`\beta (KL - I_c)`.
+
+    The variational discriminator bottleneck (Peng et al., 2018, https://arxiv.org/abs/1810.00821, Eq. 5).
+
+    Args:
+        kl: information of the latent, any shape, nats.
+        beta: the multiplier; taken as a constant, as :func:`dual_ascent` adapts it.
+        information_target: I_c, nats, in the reduction in which ``kl`` is given.
+
+    Returns:
+        the shape of ``kl``.
+
+    >>> information_bottleneck(torch.tensor([0.5]), 2.0, 0.2)
+    tensor([0.6000])
+    """
+    return beta * (kl - information_target)
+
+
+def dual_ascent(
+    multiplier: Tensor, violation: Tensor, step_size: float | Tensor, maximum: float | None = None
+) -> Tensor:
+    r"""One step of a constraint's multiplier, :math:`\beta \leftarrow \max(0, \beta + \alpha (KL - I_c))`.
+
+    Args:
+        multiplier: beta, any shape.
+        violation: by how much the constraint is broken, ``KL - I_c``; negative where it holds.
+        step_size: alpha.
+        maximum: where to stop; ``None`` for nowhere.
+
+    Returns:
+        the new multiplier, not differentiable.
+
+    >>> dual_ascent(torch.tensor(0.1), torch.tensor(-3.0), 0.01)
+    tensor(0.0700)
+    >>> dual_ascent(torch.tensor(0.1), torch.tensor(-30.0), 0.01)
+    tensor(0.)
+    """
+    multiplier, violation = multiplier.detach(), violation.detach()
+    return (multiplier + step_size * violation).clamp(min=0.0, max=maximum)
+
+
+def explained_variance(target: Tensor, prediction: Tensor, mask: Tensor | None = None) -> Tensor:
+    r"""How much of the targets' variance a prediction accounts for, :math:`1 - Var(y - \hat y) / Var(y)`.
+
+    1 is perfect, 0 no better than a constant, below 0 worse than that. Constant targets give 0.
+
+    Args:
+        target: any shape.
+        prediction: the same shape.
+        mask: bool, the same shape: which entries count. All, when ``None``.
+
+    Returns:
+        a scalar, not differentiable.
+
+    Raises:
+        ValueError: when the shapes differ.
+
+    >>> explained_variance(torch.tensor([1.0, 2.0, 3.0]), torch.tensor([2.0, 3.0, 4.0]))
+    tensor(1.)
+    >>> explained_variance(torch.tensor([1.0, 2.0, 3.0]), torch.zeros(3))
+    tensor(0.)
+    """
+    _assert_same_shape(explained_variance, target=target, prediction=prediction)
+    target, prediction = target.detach(), prediction.detach()
+    weight = torch.ones_like(target) if mask is None else mask.to(target.dtype)
+    count = weight.sum().clamp_min(1.0)
+
+    def variance(x: Tensor) -> Tensor:
+        # select, not multiply: what the mask hides may be infinite
+        x = torch.where(weight > 0, x, 0.0)
+        return (weight * (x - x.sum() / count).square()).sum() / count
+
+    total = variance(target)
+    return torch.where(total > 0, 1.0 - variance(target - prediction) / total, 0.0)
+
+
+def _assert_same_shape(function: object, **tensors: Tensor) -> None:
+    shapes = {name: tuple(tensor.shape) for name, tensor in tensors.items()}
+    if len(set(shapes.values())) > 1:
+        raise ValueError(
+            f"{getattr(function, '__name__', function)}: shapes differ: {shapes}; give equal ones"
+        )
+
+
+def _assert_transitions(
+    cumulant: Tensor, next_value: Tensor, done: Tensor, terminated: Tensor, time_dim: int
+) -> None:
+    shapes = {
+        "cumulant": tuple(cumulant.shape),
+        "next_value": tuple(next_value.shape),
+        "done": tuple(done.shape),
+        "terminated": tuple(terminated.shape),
+    }
+    if cumulant.ndim < 2 or not -cumulant.ndim <= time_dim < cumulant.ndim:
+        raise ValueError(
+            f"returns need a time and a feature dimension, (*batch, T, F); time_dim={time_dim}, got {shapes}"
+        )
+    flags = (*cumulant.shape[:-1], 1)
+    if (
+        next_value.shape != cumulant.shape
+        or done.shape != terminated.shape
+        or tuple(done.shape) not in (flags, tuple(cumulant.shape))
+    ):
+        raise ValueError(
+            "returns need cumulant and next_value of one shape, done and terminated of that shape or with "
+            f"1 feature; got {shapes}"
+        )
+    if done.dtype != torch.bool or terminated.dtype != torch.bool:
+        raise ValueError(f"done and terminated must be bool; got {done.dtype} and {terminated.dtype}")
+    if cumulant.shape[time_dim] == 0:
+        raise ValueError(f"returns need at least one step; got {shapes}")

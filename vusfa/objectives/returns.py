@@ -1,0 +1,361 @@
+r"""The estimator that writes advantage, value target and successor target from one evaluation of the critic.
+
+Bootstrapping needs the critic at the states ``s_0 .. s_{T-1}`` that acted *and* at the states that their
+steps led to. In a rollout the latter are, but for a few, the former shifted by one. So the critic is
+evaluated once over a batch of the T root states and, beside them, only those next states that are not the
+next root: the last of each row, and those of steps that ended an episode in mid-rollout (whose next root
+already belongs to the next episode).
+"""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModuleBase, dispatch
+from tensordict.utils import NestedKey, unravel_key
+from torch import Tensor
+from torchrl.objectives.value import ValueEstimatorBase
+
+from vusfa.objectives.functional import lambda_return, n_step_return
+
+__all__ = ["USFEstimator"]
+
+MASK_KEY = ("collector", "mask")
+
+
+class USFEstimator(ValueEstimatorBase):
+    r"""Writes ``advantage``, ``value_target`` and, where the critic has successor features,
+    ``successor_target``.
+
+    .. math::
+        G_t &= r_t + \gamma [(1 - \lambda) V(s_{t+1}) + \lambda G_{t+1}], \qquad A_t = G_t - V(s_t) \\
+        \Psi_t &= \phi(s_{t+1}) + \gamma [(1 - \lambda) \psi(s_{t+1}) + \lambda \Psi_{t+1}]
+
+    The brackets are 0 beyond a terminal; at a time-out and at the rollout's end V and psi of the state
+    reached stand in for the future. With ``lmbda=1`` these are VUSFA's n-step targets
+    (https://arxiv.org/abs/1908.06376, Algorithm 1, as its released code has it). For a critic without
+    successor features this is the lambda return, and the advantage is the generalised advantage estimate
+    (Schulman et al., 2015, https://arxiv.org/abs/1506.02438).
+
+    Targets are constants: nothing is differentiated. The input has shape ``(*batch, T)``; time is the
+    dimension named ``"time"``, else the last. The critic must be one that treats the steps of a batch
+    independently, or a recurrent one by TorchRL's convention, which reads ``is_init``.
+
+    Args:
+        value_network: the critic; writes the value and, if it has them, successor features and state
+            embedding.
+        gamma: discount per step.
+        lmbda: weight of the longer return, in [0, 1]; 1 is the n-step return up to the rollout's end, 0 the
+            one-step target.
+        n_steps: bootstrap after this many steps at the latest; ``None`` for the rollout's end. Needs
+            ``lmbda=1``.
+        normalize_advantage: shift and scale the advantages of a batch to mean 0 and deviation 1.
+        bootstrap_at_timeout: ``False`` takes a time-out for a terminal, as the paper's released code does.
+        embedding_at: ``"next"`` sums the embeddings from s_{t+1} on (the paper's Eqs. 4 and 13 and its code),
+            ``"current"`` from s_t on (its Eq. 6).
+        device: accepted for TorchRL's sake; the estimator follows its input.
+
+    Raises:
+        ValueError: for a hyperparameter out of its range.
+
+    >>> from tensordict.nn import TensorDictModule
+    >>> critic = TensorDictModule(lambda x: x.sum(-1, keepdim=True), in_keys=["x"], out_keys=["state_value"])
+    >>> no = torch.zeros(3, 1, dtype=torch.bool)
+    >>> rollout = TensorDict({
+    ...     "x": torch.tensor([[0.0], [1.0], [2.0]]),
+    ...     "next": {
+    ...         "x": torch.tensor([[1.0], [2.0], [3.0]]),
+    ...         "reward": torch.ones(3, 1), "done": no, "terminated": no,
+    ...     },
+    ... }, [3])
+    >>> rollout = USFEstimator(value_network=critic, gamma=0.5)(rollout)
+    >>> rollout["value_target"].squeeze(-1)
+    tensor([2.1250, 2.2500, 2.5000])
+    >>> rollout["advantage"].squeeze(-1)
+    tensor([2.1250, 1.2500, 0.5000])
+    """
+
+    @dataclass
+    class _AcceptedKeys(ValueEstimatorBase._AcceptedKeys):
+        """The keys that ``set_keys`` takes, with their defaults.
+
+        Attributes:
+            advantage: where the advantage is written.
+            value_target: where the value's target is written.
+            value: the value, which the critic writes.
+            successor_features: psi, which the critic writes.
+            state_embedding: phi, which the critic writes.
+            successor_target: where psi's target is written.
+            reward: under ``"next"``.
+            done: under ``"next"``.
+            terminated: under ``"next"``.
+            steps_to_next_obs: of TorchRL's estimators; not read here.
+            sample_log_prob: of TorchRL's estimators; not read here.
+        """
+
+        # TorchRL looks keys up in this very class, so that those of its parent are repeated
+        advantage: NestedKey = "advantage"
+        value_target: NestedKey = "value_target"
+        value: NestedKey = "state_value"
+        successor_features: NestedKey = "successor_features"
+        state_embedding: NestedKey = "state_embedding"
+        successor_target: NestedKey = "successor_target"
+        reward: NestedKey = "reward"
+        done: NestedKey = "done"
+        terminated: NestedKey = "terminated"
+        steps_to_next_obs: NestedKey = "steps_to_next_obs"
+        sample_log_prob: NestedKey | None = None
+
+    default_keys = _AcceptedKeys
+
+    def __init__(
+        self,
+        *,
+        value_network: TensorDictModuleBase,
+        gamma: float = 0.99,
+        lmbda: float = 1.0,
+        n_steps: int | None = None,
+        normalize_advantage: bool = False,
+        bootstrap_at_timeout: bool = True,
+        embedding_at: str = "next",
+        device: torch.device | str | None = None,
+    ) -> None:
+        super().__init__(value_network=value_network, device=device)
+        gamma, lmbda = float(gamma), float(lmbda)
+        if not 0.0 <= gamma <= 1.0:
+            raise ValueError(f"USFEstimator: gamma is {gamma}; give a number in [0, 1]")
+        if not 0.0 <= lmbda <= 1.0:
+            raise ValueError(f"USFEstimator: lmbda is {lmbda}; give a number in [0, 1]")
+        if n_steps is not None and (n_steps < 1 or lmbda != 1.0):
+            raise ValueError(
+                f"USFEstimator: n_steps is {n_steps} with lmbda {lmbda}; give at least 1, with lmbda 1"
+            )
+        if embedding_at not in ("next", "current"):
+            raise ValueError(f"USFEstimator: embedding_at is {embedding_at!r}; give 'next' or 'current'")
+        self.gamma = gamma
+        self.lmbda = lmbda
+        self.n_steps = n_steps
+        self.normalize_advantage = normalize_advantage
+        self.bootstrap_at_timeout = bootstrap_at_timeout
+        self.embedding_at = embedding_at
+
+    @property
+    def has_successor(self) -> bool:
+        """Whether the critic writes successor features and state embeddings."""
+        written = {unravel_key(key) for key in self.value_network.out_keys}
+        wanted = (self.tensor_keys.successor_features, self.tensor_keys.state_embedding)
+        return all(unravel_key(key) in written for key in wanted)
+
+    @property
+    def out_keys(self) -> list[NestedKey]:
+        """The entries written."""
+        keys = [self.tensor_keys.advantage, self.tensor_keys.value_target]
+        return keys + [self.tensor_keys.successor_target] if self.has_successor else keys
+
+    @dispatch
+    def forward(
+        self,
+        tensordict: TensorDictBase,
+        *,
+        params: TensorDictBase | None = None,
+        target_params: TensorDictBase | None = None,
+        time_dim: int | None = None,
+    ) -> TensorDictBase:
+        """Write the targets into a rollout.
+
+        Args:
+            tensordict: ``(*batch, T)``, with the critic's inputs at the root and under ``"next"``, and
+                reward, done and terminated under ``"next"``.
+            params: the critic's parameters; its own, when ``None``.
+            target_params: used in the place of ``params`` when given.
+            time_dim: the dimension of time.
+
+        Returns:
+            the same tensordict, with ``advantage`` and ``value_target``, ``(*batch, T, 1)``, and
+            ``successor_target``, ``(*batch, T, E)``.
+
+        Raises:
+            ValueError: when the tensordict has no time dimension.
+        """
+        if tensordict.batch_dims < 1:
+            raise ValueError(
+                "USFEstimator: a rollout has at least the time dimension; got an empty batch size"
+            )
+        time_dim = self._get_time_dim(time_dim, tensordict)
+        last = tensordict.batch_dims - 1
+        data = tensordict if time_dim == last else tensordict.transpose(time_dim, last)
+        targets = self._targets(data, params if target_params is None else target_params)
+        if time_dim != last:
+            targets = targets.transpose(time_dim, last)
+        return tensordict.update(targets)
+
+    def value_estimate(
+        self, tensordict: TensorDictBase, target_params: TensorDictBase | None = None, **_: Any
+    ) -> Tensor:
+        """The value targets alone; see :meth:`forward`.
+
+        Args:
+            tensordict: ``(*batch, T)``, not written.
+            target_params: the critic's parameters; its own, when ``None``.
+
+        Returns:
+            ``(*batch, T, 1)``.
+        """
+        targets = self(tensordict.copy(), params=target_params)
+        return targets.get(self.tensor_keys.value_target)
+
+    @torch.no_grad()
+    def _targets(self, data: TensorDictBase, params: TensorDictBase | None) -> TensorDict:
+        keys = self.tensor_keys
+        reward = data.get(("next", keys.reward))
+        done = data.get(("next", keys.done))
+        terminated = data.get(("next", keys.terminated), done)
+        if not self.bootstrap_at_timeout:
+            terminated = done
+        mask = data.get(MASK_KEY, None)
+        ended = _cut_at_padding(done, mask)
+
+        wanted = [keys.value]
+        if self.has_successor:
+            wanted += [keys.successor_features, keys.state_embedding]
+        with (
+            contextlib.nullcontext()
+            if params is None
+            else params.to_module(self.value_network, preserve_module_state=False)
+        ):
+            root, following = evaluate_rollout(self.value_network, data, ended.any(-1), wanted)
+        value, next_value = root[0].to(reward.dtype), following[0].to(reward.dtype)
+        if not self.has_successor:
+            value_target = self._return(reward, next_value, ended, terminated)
+        else:
+            embedding = following[2] if self.embedding_at == "next" else root[2]
+            # reward and embedding are summed by the same recursion: one vector, one pass
+            both = self._return(
+                torch.cat([reward, embedding.to(reward.dtype)], -1),
+                torch.cat([next_value, following[1].to(reward.dtype)], -1),
+                ended.any(-1, keepdim=True),
+                terminated.any(-1, keepdim=True),
+            )
+            value_target, successor_target = both.split([reward.shape[-1], embedding.shape[-1]], -1)
+        advantage = value_target - value
+        if self.normalize_advantage:
+            advantage = _normalize(advantage, mask)
+        targets = TensorDict({}, data.batch_size)
+        targets.set(keys.advantage, advantage)
+        targets.set(keys.value_target, value_target)
+        if self.has_successor:
+            targets.set(keys.successor_target, successor_target)
+        return targets
+
+    def _return(self, cumulant: Tensor, next_value: Tensor, done: Tensor, terminated: Tensor) -> Tensor:
+        if self.n_steps is not None:
+            return n_step_return(cumulant, next_value, self.gamma, self.n_steps, done, terminated)
+        return lambda_return(cumulant, next_value, self.gamma, self.lmbda, done, terminated)
+
+
+def evaluate_rollout(
+    critic: Callable[[TensorDictBase], TensorDictBase],
+    data: TensorDictBase,
+    ended: Tensor,
+    out_keys: list[NestedKey],
+) -> tuple[list[Tensor], list[Tensor]]:
+    """A critic's outputs at the states of a rollout and at those that its steps lead to.
+
+    Args:
+        critic: a tensordict module with ``in_keys``.
+        data: ``(*batch, T)``, the critic's inputs at the root and under ``"next"``; what ``"next"`` lacks (a
+            goal that stays) is taken from the root.
+        ended: ``(*batch, T)``, bool: the next root does not follow from this step.
+        out_keys: the outputs wanted.
+
+    Returns:
+        two lists in the order of ``out_keys``, of ``(*batch, T, ...)``: at the root states, and at the next
+        states.
+    """
+    in_keys = [unravel_key(key) for key in critic.in_keys]  # type: ignore[attr-defined]
+    root = data.select(*in_keys, strict=False)
+    following = data.get("next").select(*in_keys, strict=False)
+    outside = ended.clone()
+    outside[..., -1] = True
+    if any((key if isinstance(key, str) else key[-1]) == "is_init" for key in in_keys):
+        return _evaluate_sequences(critic, root, following, outside, in_keys, out_keys)
+
+    # states are independent of each other: one flat batch of the roots and of next states that are no root
+    rows = outside.reshape(-1).nonzero().squeeze(-1)
+    steps = outside.numel()
+    root = root.reshape(-1)
+    batch = torch.cat([root, _complete(following.reshape(-1)[rows], root[rows], in_keys)])
+    outputs = critic(batch)
+    next_rows = torch.arange(1, steps + 1, device=rows.device)
+    next_rows[rows] = torch.arange(steps, steps + len(rows), device=rows.device)
+    values = [outputs.get(key) for key in out_keys]
+    shape = outside.shape
+    return (
+        [value[:steps].reshape(*shape, *value.shape[1:]) for value in values],
+        [value[next_rows].reshape(*shape, *value.shape[1:]) for value in values],
+    )
+
+
+def _evaluate_sequences(
+    critic: Callable[[TensorDictBase], TensorDictBase],
+    root: TensorDictBase,
+    following: TensorDictBase,
+    outside: Tensor,
+    in_keys: list[NestedKey],
+    out_keys: list[NestedKey],
+) -> tuple[list[Tensor], list[Tensor]]:
+    """As :func:`evaluate_rollout`, for recurrent critics: T+1 states in order, and sequences of one state."""
+    time = root.batch_dims - 1
+    end = _complete(following[..., -1:], root[..., -1:], in_keys)
+    outputs = critic(torch.cat([root, end], time))
+    values = [outputs.get(key) for key in out_keys]
+    at_root = [value.narrow(time, 0, outside.shape[-1]) for value in values]
+    at_next = [value.narrow(time, 1, outside.shape[-1]) for value in values]
+    inside = outside.clone()
+    inside[..., -1] = False
+    if inside.any():
+        ends = critic(_complete(following[inside], root[inside], in_keys).unsqueeze(-1))
+        for i, key in enumerate(out_keys):
+            at_next[i] = at_next[i].clone()
+            at_next[i][inside] = ends.get(key).squeeze(1)
+    return at_root, at_next
+
+
+def _complete(following: TensorDictBase, root: TensorDictBase, in_keys: list[NestedKey]) -> TensorDictBase:
+    """Next states with every input: what is missing, or NaN (from a compact collector), is the root's."""
+    following = following.copy()
+    for key in in_keys:
+        at_root, at_next = root.get(key, None), following.get(key, None)
+        if at_root is None:
+            continue
+        if (key if isinstance(key, str) else key[-1]) == "is_init":
+            # the step goes on from the root's hidden state, even where the root began an episode
+            following.set(key, torch.zeros_like(at_root))
+        elif at_next is None:
+            following.set(key, at_root)
+        elif at_next.is_floating_point():
+            following.set(key, torch.where(at_next.isnan(), at_root, at_next))
+    return following
+
+
+def _cut_at_padding(done: Tensor, mask: Tensor | None) -> Tensor:
+    """``done``, and also where the next step of a row is padding."""
+    if mask is None:
+        return done
+    mask = mask.reshape(*mask.shape[: done.ndim - 1], -1).any(-1, keepdim=True)
+    padding_follows = torch.zeros_like(mask)
+    padding_follows[..., :-1, :] = ~mask[..., 1:, :]
+    return done | padding_follows
+
+
+def _normalize(advantage: Tensor, mask: Tensor | None) -> Tensor:
+    if mask is None:
+        valid = advantage
+    else:
+        valid = advantage[mask.reshape(*mask.shape[: advantage.ndim - 1], -1).any(-1)]
+    return (advantage - valid.mean()) / valid.std(correction=0).clamp_min(1e-4)

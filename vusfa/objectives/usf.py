@@ -1,0 +1,529 @@
+r"""The loss of universal successor features approximators, with or without a variational bottleneck."""
+
+from __future__ import annotations
+
+import contextlib
+from dataclasses import dataclass, fields
+from typing import Any, Literal, NamedTuple
+
+import torch
+from tensordict import TensorDict, TensorDictBase, TensorDictParams
+from tensordict.nn import (
+    ProbabilisticTensorDictSequential,
+    TensorDictModule,
+    composite_lp_aggregate,
+    dispatch,
+)
+from tensordict.utils import NestedKey, unravel_key
+from torch import Tensor
+from torch.distributions import Distribution
+from torchrl.objectives.common import LossModule
+from torchrl.objectives.utils import ValueEstimators, distance_loss
+
+from vusfa.objectives.distribution import action_entropy, action_log_prob
+from vusfa.objectives.functional import (
+    explained_variance,
+    gaussian_kl,
+    information_bottleneck,
+    policy_gradient_loss,
+    successor_loss,
+)
+from vusfa.objectives.returns import USFEstimator
+from vusfa.objectives.single_pass import Memory, run_actor, run_critic, select_inputs
+
+__all__ = ["USFLoss"]
+
+# value types of TorchRL, as the weight of the longer return that each one stands for
+LAMBDAS: dict[ValueEstimators, float] = {
+    ValueEstimators.TD0: 0.0,
+    ValueEstimators.TD1: 1.0,
+    ValueEstimators.TDLambda: 0.95,
+    ValueEstimators.GAE: 0.95,
+}
+COEFFICIENTS = ("objective_coeff", "critic_coeff", "successor_coeff", "entropy_coeff", "bottleneck_coeff")
+
+
+class Results(NamedTuple):
+    """What one pass through both networks gave."""
+
+    distribution: Distribution
+    written: TensorDictBase
+
+
+class USFLoss(LossModule):
+    r"""Advantage actor-critic with successor features and an information bottleneck.
+
+    VUSFA: Variational Universal Successor Features Approximator (https://arxiv.org/abs/1908.06376), Algorithm
+    1. Per step,
+
+    .. math::
+        -c_\pi \log \pi(a|s, g) A
+        + c_V (G - V(s, g))^2
+        + c_\psi \tfrac1E \lVert \Psi - \psi(s, g) \rVert^2
+        - c_H H[\pi]
+        + \beta (KL - I_c)
+
+    with the targets of :class:`~vusfa.objectives.USFEstimator`, which are constants: the policy's gradient
+    enters nothing but the policy (and whatever of the critic's modules the actor holds), the value's flows
+    into successor features, reward weights and trunk. KL is :func:`~vusfa.objectives.functional.gaussian_kl`,
+    averaged over the latent's features and over the branches named by ``bottleneck_on``. A term whose
+    coefficient is ``None``, or whose entries the critic does not write, is left out; so this is a plain
+    advantage actor-critic loss for a critic that writes a value only.
+
+    If the input has no advantage, the estimator computes it first. Modules that actor and critic both hold
+    run once.
+
+    Args:
+        actor_network: the policy, with ``get_dist``.
+        critic_network: writes ``state_value`` and, if it has them, ``successor_features`` and
+            ``state_embedding``, and ``goal_loc`` and ``goal_scale``, ``state_loc`` and ``state_scale``.
+        objective_coeff: c_pi.
+        critic_coeff: c_V.
+        successor_coeff: c_psi; the paper's code has 5e-4 beside losses SUMMED over its 5 steps.
+        entropy_coeff: c_H.
+        bottleneck_coeff: beta, where it starts; :class:`~vusfa.objectives.DualAscent` adapts it.
+        information_target: I_c, in nats per feature of the latent, or in all with
+            ``information_reduction="sum"``.
+        bottleneck_on: ``"both"``, ``"goal"`` or ``"state"``: the branches whose information counts, as far as
+            the critic writes them.
+        information_reduction: ``"mean"`` or ``"sum"`` over the latent's features.
+        loss_critic_type: ``"l2"`` (the square, not halved), ``"l1"`` or ``"smooth_l1"``.
+        reduction: ``"mean"``, ``"sum"`` or ``"none"`` over steps.
+        functional: whether the networks' parameters are held as tensordicts apart from the modules.
+        separate_losses: whether parameters that both networks hold are trained by the policy's loss alone.
+            What only successor features and the bottleneck train must then not be shared. Needs
+            ``functional=True``.
+
+    Coefficients and ``information_target`` are buffers: saved in the ``state_dict``, moved by ``to``, set by
+    assignment.
+
+    Returns (of ``forward``): ``loss_objective``, ``loss_critic``, ``loss_successor``, ``loss_entropy``,
+    ``loss_bottleneck``, each with its coefficient, and for the eye ``entropy``, ``explained_variance``,
+    ``kl`` and ``beta``.
+
+    >>> from tensordict.nn import TensorDictModule as Mod, TensorDictSequential as Seq
+    >>> from torchrl.modules import ProbabilisticActor
+    >>> _ = torch.manual_seed(0)
+    >>> trunk = Mod(torch.nn.Linear(3, 8), in_keys=["observation"], out_keys=["state_embedding"])
+    >>> psi = Mod(torch.nn.Linear(8, 8), in_keys=["state_embedding"], out_keys=["successor_features"])
+    >>> value = Mod(torch.nn.Linear(8, 1), in_keys=["successor_features"], out_keys=["state_value"])
+    >>> policy = Mod(torch.nn.Linear(8, 4), in_keys=["state_embedding"], out_keys=["logits"])
+    >>> actor = ProbabilisticActor(
+    ...     Seq(trunk, policy), in_keys=["logits"], distribution_class=torch.distributions.Categorical
+    ... )
+    >>> loss = USFLoss(actor, Seq(trunk, psi, value))
+    >>> batch = [2, 5]   # two rows of five steps
+    >>> rollout = TensorDict({
+    ...     "observation": torch.randn(*batch, 3),
+    ...     "action": torch.randint(4, batch),
+    ...     "next": {
+    ...         "observation": torch.randn(*batch, 3),
+    ...         "reward": torch.randn(*batch, 1),
+    ...         "done": torch.zeros(*batch, 1, dtype=torch.bool),
+    ...         "terminated": torch.zeros(*batch, 1, dtype=torch.bool),
+    ...     },
+    ... }, batch)
+    >>> losses = loss(rollout)
+    >>> sorted(losses.keys())
+    ['entropy', 'explained_variance', 'loss_critic', 'loss_entropy', 'loss_objective', 'loss_successor']
+    >>> sum(value for key, value in losses.items() if key.startswith("loss")).backward()
+    >>> loss.entropy_coeff = 0.0
+    >>> loss = loss.make_value_estimator(ValueEstimators.GAE, gamma=0.99, lmbda=0.95)
+    """
+
+    @dataclass
+    class _AcceptedKeys:
+        """The keys that ``set_keys`` takes, with their defaults; those of the estimator are passed on to it.
+
+        Attributes:
+            advantage: the advantage, computed when absent.
+            value_target: the value's target.
+            value: the value, which the critic writes.
+            successor_features: psi, which the critic writes.
+            successor_target: psi's target.
+            state_embedding: phi, which the critic writes.
+            state_loc: mean of the state's latent, which the critic writes.
+            state_scale: its scale.
+            goal_loc: mean of the goal's latent, which the critic writes.
+            goal_scale: its scale.
+            action: the action taken, or a list of keys for a composite action.
+            reward: under ``"next"``.
+            done: under ``"next"``.
+            terminated: under ``"next"``.
+            sample_log_prob: log-probability of the action when it was taken, for estimators that correct for
+                its age.
+        """
+
+        advantage: NestedKey = "advantage"
+        value_target: NestedKey = "value_target"
+        value: NestedKey = "state_value"
+        successor_features: NestedKey = "successor_features"
+        successor_target: NestedKey = "successor_target"
+        state_embedding: NestedKey = "state_embedding"
+        state_loc: NestedKey = "state_loc"
+        state_scale: NestedKey = "state_scale"
+        goal_loc: NestedKey = "goal_loc"
+        goal_scale: NestedKey = "goal_scale"
+        action: NestedKey | list[NestedKey] = "action"
+        reward: NestedKey = "reward"
+        done: NestedKey = "done"
+        terminated: NestedKey = "terminated"
+        sample_log_prob: NestedKey | list[NestedKey] | None = None
+
+        def __post_init__(self) -> None:
+            if self.sample_log_prob is None:
+                aggregate = composite_lp_aggregate(nowarn=True)
+                self.sample_log_prob = "sample_log_prob" if aggregate else "action_log_prob"
+
+    default_keys = _AcceptedKeys
+    tensor_keys: _AcceptedKeys
+    default_value_estimator = ValueEstimators.TD1
+    SUPPORTED_VALUE_ESTIMATORS = tuple(LAMBDAS)
+    _schedulable_buffers = frozenset({*COEFFICIENTS, "information_target"})
+
+    actor_network: TensorDictModule
+    critic_network: TensorDictModule
+    actor_network_params: TensorDictParams | None
+    critic_network_params: TensorDictParams | None
+    target_actor_network_params: TensorDictParams | None
+    target_critic_network_params: TensorDictParams | None
+    information_target: Tensor
+    last_kl: Tensor
+
+    def __init__(
+        self,
+        actor_network: ProbabilisticTensorDictSequential,
+        critic_network: TensorDictModule,
+        *,
+        objective_coeff: float | None = 1.0,
+        critic_coeff: float | None = 0.5,
+        successor_coeff: float | None = 5e-4,
+        entropy_coeff: float | None = 0.01,
+        bottleneck_coeff: float | None = 0.0,
+        information_target: float = 0.2,
+        bottleneck_on: Literal["both", "goal", "state"] = "both",
+        information_reduction: Literal["mean", "sum"] = "mean",
+        loss_critic_type: Literal["l1", "l2", "smooth_l1"] = "l2",
+        reduction: Literal["none", "mean", "sum"] | None = "mean",
+        functional: bool = True,
+        separate_losses: bool = False,
+    ) -> None:
+        reduction = reduction or "mean"
+        _check_choice("bottleneck_on", bottleneck_on, ("both", "goal", "state"))
+        _check_choice("information_reduction", information_reduction, ("mean", "sum"))
+        _check_choice("loss_critic_type", loss_critic_type, ("l1", "l2", "smooth_l1"))
+        _check_choice("reduction", reduction, ("none", "mean", "sum"))
+        if separate_losses and not functional:
+            raise ValueError("USFLoss: separate_losses=True needs functional=True")
+        self._functional = functional
+        self._in_keys: list[NestedKey] | None = None
+        self._out_keys: list[NestedKey] | None = None
+        super().__init__()
+        if functional:
+            self.convert_to_functional(actor_network, "actor_network")
+            policy_params = list(actor_network.parameters()) if separate_losses else None
+            self.convert_to_functional(critic_network, "critic_network", compare_against=policy_params)
+        else:
+            self.actor_network = actor_network
+            self.critic_network = critic_network
+            self.actor_network_params = None
+            self.critic_network_params = None
+            self.target_actor_network_params = None
+            self.target_critic_network_params = None
+        self.separate_losses = separate_losses
+        self.bottleneck_on = bottleneck_on
+        self.information_reduction = information_reduction
+        self.loss_critic_type = loss_critic_type
+        self.reduction = reduction
+        device, dtype = self._default_device, torch.get_default_dtype()
+        values = (objective_coeff, critic_coeff, successor_coeff, entropy_coeff, bottleneck_coeff)
+        for name, value in zip(COEFFICIENTS, values, strict=True):
+            self.register_coeff_buffer(name, value, device=device, dtype=dtype)
+        self.register_coeff_buffer("information_target", information_target, device=device, dtype=dtype)
+        # the constraint's last measurement, for DualAscent; at first on target, so that nothing moves
+        self.register_buffer("last_kl", self.information_target.clone())
+        actions, log_probs = self.actor_network.dist_sample_keys, self.actor_network.log_prob_keys
+        self.set_keys(
+            action=actions if len(actions) > 1 else actions[0],
+            sample_log_prob=log_probs if len(log_probs) > 1 else log_probs[0],
+        )
+
+    @property
+    def functional(self) -> bool:
+        """Whether parameters are held apart from the modules."""
+        return self._functional
+
+    @property
+    def has_critic(self) -> bool:
+        """Whether there is a value term."""
+        return self.critic_coeff is not None
+
+    @property
+    def has_successor(self) -> bool:
+        """Whether there is a term of the successor features."""
+        keys = self.tensor_keys
+        return self.successor_coeff is not None and self._writes(
+            keys.successor_features, keys.state_embedding
+        )
+
+    @property
+    def has_bottleneck(self) -> bool:
+        """Whether there is a term of the information bottleneck."""
+        return self.bottleneck_coeff is not None and len(self._branches()) > 0
+
+    @property
+    def in_keys(self) -> list[NestedKey]:
+        """Everything that ``forward`` may read."""
+        if self._in_keys is not None:
+            return self._in_keys
+        keys = self.tensor_keys
+        networks = [*self.actor_network.in_keys, *self.critic_network.in_keys]
+        actions = keys.action if isinstance(keys.action, list) else [keys.action]
+        following = [keys.reward, keys.done, keys.terminated, *self.critic_network.in_keys]
+        everything = [*actions, *networks, *(("next", key) for key in following)]
+        return list(dict.fromkeys(unravel_key(key) for key in everything))
+
+    @in_keys.setter
+    def in_keys(self, value: list[NestedKey] | None) -> None:
+        self._in_keys = value
+
+    @property
+    def out_keys(self) -> list[NestedKey]:
+        """What ``forward`` returns, in this order when called without a tensordict."""
+        if self._out_keys is not None:
+            return self._out_keys
+        groups = [
+            (self.objective_coeff is not None, ["loss_objective"]),
+            (self.has_critic, ["loss_critic", "explained_variance"]),
+            (self.entropy_coeff is not None, ["entropy", "loss_entropy"]),
+            (self.has_successor, ["loss_successor"]),
+            (self.has_bottleneck, ["loss_bottleneck", "kl", "beta"]),
+        ]
+        return [key for present, keys in groups if present for key in keys]
+
+    @out_keys.setter
+    def out_keys(self, value: list[NestedKey] | None) -> None:
+        self._out_keys = value
+
+    @dispatch
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """The terms of the loss.
+
+        Args:
+            tensordict: a rollout ``(*batch, T)``, or any batch of steps that already has its targets. Not
+                written.
+
+        Returns:
+            a tensordict without batch dimensions; terms are scalars, or ``(*batch, T)`` with
+            ``reduction="none"``.
+
+        Raises:
+            KeyError: when there is an advantage but not the other targets that the terms need.
+        """
+        tensordict = tensordict.clone(False)
+        if tensordict.get(self.tensor_keys.advantage, None) is None:
+            params = self.critic_network_params.detach() if self.critic_network_params is not None else None
+            self.value_estimator(tensordict, params=params, target_params=params)
+        results = self._evaluate(tensordict)
+        out = TensorDict({}, batch_size=[])
+        if self.objective_coeff is not None:
+            self._set_term(out, "loss_objective", self.loss_objective(tensordict, results), tensordict)
+        if self.has_critic:
+            term, explained = self.loss_critic(tensordict, results)
+            self._set_term(out, "loss_critic", term, tensordict)
+            out.set("explained_variance", explained)
+        if self.entropy_coeff is not None:
+            term, entropy = self.loss_entropy(tensordict, results)
+            out.set("entropy", self._mean(entropy, tensordict))
+            self._set_term(out, "loss_entropy", term, tensordict)
+        if self.has_successor:
+            self._set_term(out, "loss_successor", self.loss_successor(tensordict, results), tensordict)
+        if self.has_bottleneck:
+            term, kl = self.loss_bottleneck(tensordict, results)
+            self._set_term(out, "loss_bottleneck", term, tensordict)
+            out.set("kl", self._mean(kl, tensordict))
+            out.set("beta", self.bottleneck_coeff.detach().clone())
+            self.last_kl.copy_(out.get("kl"))
+        self._clear_weakrefs(tensordict, out, "actor_network_params", "critic_network_params")
+        return out
+
+    def loss_objective(self, tensordict: TensorDictBase, results: Results | None = None) -> Tensor:
+        """The policy's term, ``-c_pi log pi(a) A``.
+
+        Args:
+            tensordict: steps with their advantage, ``(*batch,)``.
+            results: of the networks on these steps; run here, when ``None``.
+
+        Returns:
+            ``(*batch,)``, not reduced.
+        """
+        dist = (results or self._evaluate(tensordict)).distribution
+        log_prob = action_log_prob(dist, tensordict, self.tensor_keys.action)
+        advantage = self._target(tensordict, "advantage")
+        return self.objective_coeff * policy_gradient_loss(log_prob, _per_step(advantage, log_prob))
+
+    def loss_entropy(
+        self, tensordict: TensorDictBase, results: Results | None = None
+    ) -> tuple[Tensor, Tensor]:
+        """The entropy bonus, ``-c_H H``, and the entropy.
+
+        Args:
+            tensordict: steps, ``(*batch,)``.
+            results: of the networks on these steps; run here, when ``None``.
+
+        Returns:
+            two tensors ``(*batch,)``, not reduced.
+        """
+        entropy = action_entropy((results or self._evaluate(tensordict)).distribution)
+        return -self.entropy_coeff * entropy, entropy.detach()
+
+    def loss_critic(
+        self, tensordict: TensorDictBase, results: Results | None = None
+    ) -> tuple[Tensor, Tensor]:
+        """The value's term, ``c_V (G - V)^2`` for l2, and how much of the targets' variance the value
+        explains.
+
+        Args:
+            tensordict: steps with their value target, ``(*batch,)``.
+            results: of the networks on these steps; run here, when ``None``.
+
+        Returns:
+            ``(*batch,)``, not reduced, and a scalar.
+        """
+        target = self._target(tensordict, "value_target").detach()
+        value = (results or self._evaluate(tensordict)).written.get(self.tensor_keys.value).to(target.dtype)
+        mask = self._valid(tensordict, target)
+        distance = distance_loss(target, value, loss_function=self.loss_critic_type)
+        return self.critic_coeff * distance.squeeze(-1), explained_variance(target, value, mask)
+
+    def loss_successor(self, tensordict: TensorDictBase, results: Results | None = None) -> Tensor:
+        """The successor features' term, ``c_psi`` times the mean squared error over features.
+
+        Args:
+            tensordict: steps with their successor target, ``(*batch,)``.
+            results: of the networks on these steps; run here, when ``None``.
+
+        Returns:
+            ``(*batch,)``, not reduced.
+        """
+        target = self._target(tensordict, "successor_target")
+        written = (results or self._evaluate(tensordict)).written
+        successor = written.get(self.tensor_keys.successor_features).to(target.dtype)
+        return self.successor_coeff * successor_loss(successor, target)
+
+    def loss_bottleneck(
+        self, tensordict: TensorDictBase, results: Results | None = None
+    ) -> tuple[Tensor, Tensor]:
+        """The information constraint's term, ``beta (KL - I_c)``, and KL.
+
+        Args:
+            tensordict: steps, ``(*batch,)``.
+            results: of the networks on these steps; run here, when ``None``.
+
+        Returns:
+            two tensors ``(*batch,)``, not reduced.
+        """
+        written = (results or self._evaluate(tensordict)).written
+        divergences = [gaussian_kl(written.get(loc), written.get(scale)) for loc, scale in self._branches()]
+        kl = torch.stack(divergences).mean(0)
+        kl = kl.sum(-1) if self.information_reduction == "sum" else kl.mean(-1)
+        # a copy: the multiplier may move before this graph is differentiated
+        beta = self.bottleneck_coeff.detach().clone()
+        return information_bottleneck(kl, beta, self.information_target), kl.detach()
+
+    def make_value_estimator(self, value_type: Any = None, **hyperparams: Any) -> USFLoss:
+        """Choose how targets are computed.
+
+        Args:
+            value_type: TD0, TD1, TDLambda or GAE of :class:`~torchrl.objectives.ValueEstimators`, which stand
+                for a ``lmbda`` of 0, 1, 0.95 and 0.95 (TDLambda and GAE are the same here: the advantage is
+                target minus value); an estimator, or a class of one. TD1 when ``None``.
+            **hyperparams: of :class:`~vusfa.objectives.USFEstimator`, such as ``gamma`` and ``lmbda``, or of
+                the class given.
+
+        Returns:
+            the loss itself.
+
+        Raises:
+            NotImplementedError: for another value type.
+        """
+        value_type = self.default_value_estimator if value_type is None else value_type
+        if isinstance(value_type, ValueEstimators):
+            if value_type not in LAMBDAS:
+                supported = [supported.name for supported in LAMBDAS]
+                raise NotImplementedError(
+                    f"USFLoss computes no {value_type.name} targets; choose one of {supported}"
+                )
+            hyperparams = {"lmbda": LAMBDAS[value_type], "value_network": self.critic_network, **hyperparams}
+            self._value_estimator = USFEstimator(**hyperparams)
+            self.value_type = value_type
+        else:
+            super().make_value_estimator(value_type, **hyperparams)
+        self._forward_value_estimator_keys()
+        return self
+
+    def _forward_value_estimator_keys(self, **_: Any) -> None:
+        estimator = self._value_estimator
+        if estimator is not None:
+            accepted = {field.name for field in fields(estimator._AcceptedKeys)}
+            mine = {field.name: getattr(self.tensor_keys, field.name) for field in fields(self.tensor_keys)}
+            estimator.set_keys(**{name: key for name, key in mine.items() if name in accepted})
+
+    def _evaluate(self, tensordict: TensorDictBase) -> Results:
+        actor, critic = self.actor_network, self.critic_network
+        inputs = select_inputs(tensordict, *actor.in_keys, *critic.in_keys)
+        memory = Memory()
+        with self._params_of("actor_network"):
+            distribution = run_actor(actor, inputs.select(*actor.in_keys, strict=False), memory)
+        if self.separate_losses:
+            # what both hold is a constant to the critic: its modules run again, on detached parameters
+            memory = Memory()
+        with self._params_of("critic_network"):
+            written = run_critic(critic, inputs.select(*critic.in_keys, strict=False), memory)
+        return Results(distribution, written)
+
+    def _params_of(self, name: str) -> contextlib.AbstractContextManager:
+        if not self.functional:
+            return contextlib.nullcontext()
+        return getattr(self, name + "_params").to_module(getattr(self, name), preserve_module_state=False)
+
+    def _writes(self, *keys: NestedKey) -> bool:
+        written = {unravel_key(key) for key in self.critic_network.out_keys}
+        return all(unravel_key(key) in written for key in keys)
+
+    def _branches(self) -> list[tuple[NestedKey, NestedKey]]:
+        """Keys of mean and scale of the latents whose information counts."""
+        keys = self.tensor_keys
+        branches = {"goal": (keys.goal_loc, keys.goal_scale), "state": (keys.state_loc, keys.state_scale)}
+        chosen = branches if self.bottleneck_on == "both" else [self.bottleneck_on]
+        return [branches[name] for name in chosen if self._writes(*branches[name])]
+
+    def _target(self, tensordict: TensorDictBase, name: str) -> Tensor:
+        key = getattr(self.tensor_keys, name)
+        target = tensordict.get(key, None)
+        if target is None:
+            raise KeyError(
+                f"the input has no {key!r}. All targets are computed where the advantage "
+                f"({self.tensor_keys.advantage!r}) is absent; beforehand, compute them by loss.value_estimator"
+            )
+        return target
+
+    def _set_term(self, out: TensorDict, name: str, term: Tensor, tensordict: TensorDictBase) -> None:
+        out.set(name, self._reduce_loss(term, tensordict))
+
+    def _mean(self, values: Tensor, tensordict: TensorDictBase) -> Tensor:
+        return self._reduce_loss(values.detach(), tensordict, reduction="mean")
+
+    def _valid(self, tensordict: TensorDictBase, like: Tensor) -> Tensor | None:
+        masks = [tensordict.get(key, None) for key in self._loss_mask_keys()]
+        expanded = [self._expand_loss_mask(mask, like) for mask in masks if mask is not None]
+        return torch.stack(expanded).all(0) if expanded else None
+
+
+def _per_step(values: Tensor, like: Tensor) -> Tensor:
+    return values.squeeze(-1) if values.ndim > like.ndim else values
+
+
+def _check_choice(name: str, value: str, choices: tuple[str, ...]) -> None:
+    if value not in choices:
+        raise ValueError(f"USFLoss: {name} is {value!r}; give one of {choices}")
