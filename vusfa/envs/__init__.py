@@ -1,0 +1,12 @@
+"""How an agent lives in a world of scenes: the navigation task for TorchRL and Gymnasium.
+
+>>> from vusfa.scenes import SceneSet
+>>> env = TargetNavEnv(SceneSet.bundled(["bathroom"]), goals="paper", batch_size=[5], seed=0)
+>>> env.rollout(7, break_when_any_done=False)["state_id"].shape
+torch.Size([5, 7, 4])
+"""
+
+from vusfa.envs.goals import resolve_goals, spread_goals
+from vusfa.envs.navigation import TargetNavEnv
+
+__all__ = ["TargetNavEnv", "resolve_goals", "spread_goals"]

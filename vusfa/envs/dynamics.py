@@ -1,0 +1,134 @@
+"""The task as pure functions of tensors: one step of many agents at once.
+
+A scene is a finite graph of photographed poses. An action moves the agent along an edge; where there is none
+the agent stays and the step counts as a collision, which is a step like any other: it costs time, and the
+frame it ends on (the same as before) is pushed into the history. An episode ends at the goal, which is one
+pose, heading included, or when the time is up. (Zhu et al. 2017, https://arxiv.org/abs/1609.05143, section 4;
+the released code of VUSFA.)
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+__all__ = ["Rewards", "Transition", "push_frame", "start_history", "step"]
+
+
+class Rewards(NamedTuple):
+    """What a step earns: three scalars as 0-dimensional float32 tensors, so that the reward's type never
+    varies.
+
+    >>> Rewards.of(goal=10.0, step=-0.01, collision=-0.1).collision
+    tensor(-0.1000)
+    """
+
+    goal: Tensor
+    step: Tensor
+    collision: Tensor | None
+
+    @classmethod
+    def of(cls, goal: float = 1.0, step: float = -0.01, collision: float | None = None) -> Rewards:
+        """Build it from numbers. Without a ``collision`` reward a collision earns what any step earns."""
+        as_tensor = [
+            None if x is None else torch.tensor(x, dtype=torch.float32) for x in (goal, step, collision)
+        ]
+        return cls(*as_tensor)  # type: ignore[arg-type]
+
+
+class Transition(NamedTuple):
+    """What one step leads to; shapes for a batch ``(*B,)`` of agents and a history of ``H`` frames.
+
+    Attributes:
+        state_id: (*B, H) int64, oldest first; ``[..., -1]`` is where the agent now is.
+        reward: (*B, 1) float32.
+        collided: (*B, 1) bool, the move was blocked and the agent stayed.
+        step_count: (*B, 1) int64, steps since the episode began, this one included.
+        terminated: (*B, 1) bool, the agent is at its goal.
+        truncated: (*B, 1) bool, the time is up (whether or not the goal was reached with the last step).
+        done: (*B, 1) bool, either of the two.
+    """
+
+    state_id: Tensor
+    reward: Tensor
+    collided: Tensor
+    step_count: Tensor
+    terminated: Tensor
+    truncated: Tensor
+    done: Tensor
+
+
+def start_history(state: Tensor, history: int) -> Tensor:
+    """History of an episode that has just begun: its first frame, repeated. (*B,) -> (*B, H), its own memory.
+
+    >>> start_history(torch.tensor([7, 3]), 2)
+    tensor([[7, 7],
+            [3, 3]])
+    """
+    return state.unsqueeze(-1).repeat(*(1,) * state.ndim, history)
+
+
+def push_frame(state_id: Tensor, state: Tensor) -> Tensor:
+    """Forget the oldest frame of (*B, H) and append ``state`` (*B,).
+
+    >>> push_frame(torch.tensor([5, 6, 7]), torch.tensor(9))
+    tensor([6, 7, 9])
+    """
+    return torch.cat([state_id[..., 1:], state.unsqueeze(-1)], -1)
+
+
+def step(
+    successor: Tensor,
+    blocked: Tensor,
+    rewards: Rewards,
+    max_steps: int,
+    state_id: Tensor,
+    goal_id: Tensor,
+    step_count: Tensor,
+    action: Tensor,
+) -> Transition:
+    """Move every agent by one action. Nothing is written in place, nothing is drawn at random.
+
+    Args:
+        successor: (S, A) int64, the state each action leads to; a blocked one leads back to the same state.
+        blocked: (S, A) bool.
+        rewards: what a step earns. The goal's reward comes before the collision's.
+        max_steps: steps after which an episode is truncated.
+        state_id: (*B, H) int64, oldest first.
+        goal_id: (*B,) int64.
+        step_count: (*B, 1) int64, steps since the episode began.
+        action: (*B,) int64 in 0..A-1.
+
+    Returns:
+        The :class:`Transition`.
+
+    Raises:
+        IndexError: an action or a state is out of range.
+
+    >>> line = torch.tensor([[1, 0], [2, 0], [2, 1]])  # right, left
+    >>> walls = torch.tensor([[False, True], [False, False], [True, False]])
+    >>> at, goal, clock = torch.tensor([[0, 1]]), torch.tensor([2]), torch.tensor([[4]])
+    >>> end = step(line, walls, Rewards.of(), 5, at, goal, clock, action=torch.tensor([0]))
+    >>> end.state_id.tolist(), end.reward.item(), end.terminated.item(), end.truncated.item()
+    ([[1, 2]], 1.0, True, True)
+    """
+    current = state_id[..., -1]
+    state = successor[current, action]
+    collided = blocked[current, action].unsqueeze(-1)
+    terminated = (state == goal_id).unsqueeze(-1)
+    step_count = step_count + 1
+    truncated = step_count >= max_steps
+    otherwise = (
+        rewards.step if rewards.collision is None else torch.where(collided, rewards.collision, rewards.step)
+    )
+    return Transition(
+        state_id=push_frame(state_id, state),
+        reward=torch.where(terminated, rewards.goal, otherwise),
+        collided=collided,
+        step_count=step_count,
+        terminated=terminated,
+        truncated=truncated,
+        done=terminated | truncated,
+    )

@@ -1,0 +1,223 @@
+"""Which states are goals.
+
+A goal set is written down in one of these forms, everywhere that goals can be given:
+
+=================  =======================================================================================
+``"paper"``        the goals of ``manifests/paper.yaml``: the paper's 20, and five for each bundled room
+``"all"``          every state that some other state can reach
+``"random:5"``     that many such states of each scene, drawn once and for all; "random:5:1" is another draw
+``"my.yaml"``      a manifest: the names of scenes, each with a list of state ids within the scene
+``[3, 180]``       global state ids, as a list or a tensor
+``{"hall": [3]}``  the names of scenes, each with a list of state ids within the scene
+=================  =======================================================================================
+"""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Mapping, Sequence
+from os import PathLike, fspath
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+import yaml
+from torch import Tensor
+
+from vusfa.errors import GoalError
+from vusfa.scenes import Scene, SceneSet
+from vusfa.scenes.graph import strong_components
+
+__all__ = ["PAPER_MANIFEST", "GoalSpec", "read_manifest", "resolve_goals", "spread_goals"]
+
+GoalSpec = str | PathLike[str] | Sequence[int] | Tensor | Mapping[str, Sequence[int]]
+
+PAPER_MANIFEST = Path(__file__).parent / "manifests" / "paper.yaml"
+
+
+def resolve_goals(scenes: SceneSet, goals: GoalSpec) -> Tensor:
+    """Turn any way to name goals into global state ids.
+
+    Args:
+        scenes: the world.
+        goals: one of the forms in the table above.
+
+    Returns:
+        (G,) int64 on the CPU, G at least 1; scene by scene, except for ids, whose order is kept.
+
+    Raises:
+        GoalError: an unknown form, scene or state, or no goal at all. That a goal can be reached is not
+            looked at.
+
+    >>> rooms = SceneSet.bundled(["bathroom", "kitchen"])
+    >>> resolve_goals(rooms, "all").shape, resolve_goals(rooms, "random:3").shape
+    (torch.Size([856]), torch.Size([6]))
+    >>> resolve_goals(rooms, {"kitchen": [0, 5]}).tolist()
+    [176, 181]
+    >>> resolve_goals(rooms, {"attic": [0]})
+    Traceback (most recent call last):
+    ...
+    vusfa.errors.GoalError: goals name the scene 'attic'; this set has bathroom, kitchen
+    """
+    if isinstance(goals, Tensor) or (isinstance(goals, Sequence) and not isinstance(goals, str)):
+        return _checked_ids(scenes, goals)
+    if isinstance(goals, Mapping):
+        return _by_scene(scenes, goals, "goals")
+    if not isinstance(goals, str | PathLike):
+        raise GoalError(
+            f"goals are {goals!r}; give a name, a file, state ids, or a dict of scene names to state ids"
+        )
+    text = fspath(goals)
+    if text == "paper":
+        return _paper(scenes)
+    if text == "all":
+        return torch.cat([_reachable(scene) + first for scene, first in _scenes_and_offsets(scenes)])
+    if text.startswith("random:"):
+        return _random(scenes, text)
+    if Path(text).suffix in (".yaml", ".yml"):
+        return _by_scene(scenes, read_manifest(text), text)
+    raise GoalError(
+        f"goals are {text!r}; give 'paper', 'all', 'random:5' (five a scene), a manifest (.yaml) or state ids"
+    )
+
+
+def read_manifest(path: str | PathLike[str]) -> dict[str, list[int]]:
+    """Read a YAML manifest: scene names, each with a list of state ids within the scene.
+
+    Raises:
+        GoalError: the file is missing, is not YAML, or holds anything else.
+
+    >>> read_manifest(PAPER_MANIFEST)["bathroom_02"]
+    [26, 37, 43, 53, 69]
+    """
+    try:
+        content = yaml.safe_load(Path(path).read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError) as error:
+        raise GoalError(f"{path}: cannot be read ({error}); goals come from a YAML manifest") from error
+    except yaml.YAMLError as error:
+        raise GoalError(f"{path}: is not YAML ({error}); write lines like 'bathroom: [26, 37]'") from error
+    if not isinstance(content, dict) or not content:
+        raise GoalError(f"{path}: holds no scenes; write lines like 'bathroom: [26, 37]'")
+    for name, ids in content.items():
+        if not isinstance(ids, list) or not all(type(i) is int for i in ids):
+            raise GoalError(f"{path}: scene {name!r} has {ids!r}; give a list of state ids, like [26, 37]")
+    return {str(name): ids for name, ids in content.items()}
+
+
+def spread_goals(scene: Scene, count: int) -> list[int]:
+    """Choose goals spread over a scene: farthest-point selection on shortest paths. Deterministic.
+
+    The first is the state that is the farthest from all others on average; each further one is the state
+    whose nearest chosen goal is the farthest away. A distance is the mean of there and back, in actions; ties
+    go to the lowest id. Only the largest strongly connected part of the scene is looked at, so that every
+    goal can be reached from every other.
+
+    Args:
+        scene: the scene.
+        count: how many goals, at least 1.
+
+    Returns:
+        state ids within the scene, ascending.
+
+    Raises:
+        GoalError: the scene's largest part has fewer states.
+
+    >>> corridor = torch.tensor([[1, -1], [2, 0], [3, 1], [4, 2], [-1, 3]])
+    >>> spread_goals(Scene("corridor", corridor, torch.rand(5, 1, 2)), 3)
+    [0, 2, 4]
+    """
+    part = torch.tensor(strong_components(scene.graph)[0])
+    if not 1 <= count <= len(part):
+        raise GoalError(
+            f"scene {scene.name!r}: {count} goals asked for; its largest part has {len(part)} states"
+        )
+    there = scene.distance[part][:, part].to(torch.int64)
+    both = there + there.T
+    chosen = [int(both.sum(1).argmax())]
+    while len(chosen) < count:
+        nearest = both[chosen].amin(0)
+        nearest[chosen] = -1
+        chosen.append(int((nearest == nearest.max()).nonzero()[0]))
+    return sorted(part[chosen].tolist())
+
+
+def _scenes_and_offsets(scenes: SceneSet) -> list[tuple[Scene, int]]:
+    return list(zip(scenes.scenes, scenes.offsets[:-1].tolist(), strict=True))
+
+
+def _checked_ids(scenes: SceneSet, goals: Any) -> Tensor:
+    ids = torch.as_tensor(goals).cpu()
+    if ids.ndim != 1 or not len(ids):
+        raise GoalError(
+            f"goals have the shape {tuple(ids.shape)}; give at least one global state id, as a flat list"
+        )
+    if ids.is_floating_point() or ids.is_complex() or ids.dtype == torch.bool:
+        raise GoalError(f"goals are of type {ids.dtype}; give integers, global state ids")
+    wrong = ids[(ids < 0) | (ids >= scenes.num_states)]
+    if len(wrong):
+        raise GoalError(
+            f"goal {int(wrong[0])} is out of range; {scenes} has the global ids 0..{scenes.num_states - 1}"
+        )
+    return ids.to(torch.int64)
+
+
+def _by_scene(scenes: SceneSet, goals: Mapping[str, Any], source: str) -> Tensor:
+    unknown = [name for name in goals if name not in scenes.names]
+    if unknown:
+        raise GoalError(f"{source} name the scene {unknown[0]!r}; this set has {', '.join(scenes.names)}")
+    found = []
+    for scene, first in _scenes_and_offsets(scenes):
+        ids = torch.as_tensor(goals.get(scene.name, []))
+        if not len(ids):
+            continue
+        wrong = ids[(ids < 0) | (ids >= scene.num_states)]
+        if len(wrong):
+            raise GoalError(
+                f"{source}: scene {scene.name!r} has no state {int(wrong[0])};"
+                f" its states are 0..{scene.num_states - 1}"
+            )
+        found.append(ids.to(torch.int64) + first)
+    if not found:
+        raise GoalError(f"{source}: no goal is given; give at least one state id")
+    return torch.cat(found)
+
+
+def _paper(scenes: SceneSet) -> Tensor:
+    manifest = read_manifest(PAPER_MANIFEST)
+    missing = [name for name in scenes.names if name not in manifest]
+    if missing:
+        raise GoalError(
+            f"goals 'paper' know nothing of scene {missing[0]!r}, only of {', '.join(manifest)};"
+            " give goals='random:5', state ids, or a manifest of your own"
+        )
+    return _by_scene(scenes, {name: manifest[name] for name in scenes.names}, "goals 'paper'")
+
+
+def _reachable(scene: Scene) -> Tensor:
+    """States of a scene that some other state leads to."""
+    source = torch.arange(scene.num_states).unsqueeze(1).expand_as(scene.graph)
+    entered = scene.graph[(scene.graph >= 0) & (scene.graph != source)]
+    return entered.unique()
+
+
+def _random(scenes: SceneSet, text: str) -> Tensor:
+    numbers = text.split(":")[1:]
+    if not all(number.isdecimal() for number in numbers) or len(numbers) > 2 or int(numbers[0]) < 1:
+        raise GoalError(
+            f"goals are {text!r}; write 'random:5' for five a scene, or 'random:5:1' for another draw"
+        )
+    count, draw = int(numbers[0]), int(numbers[1]) if len(numbers) == 2 else 0
+    found = []
+    for scene, first in _scenes_and_offsets(scenes):
+        candidates = _reachable(scene)
+        if len(candidates) < count:
+            raise GoalError(
+                f"goals are {text!r}, but only {len(candidates)} states of {scene.name!r} can be reached"
+            )
+        # Seeded by the scene's name: neither the order of the scenes nor the environment's seed changes the
+        # goals, so that training, evaluation and every worker mean the same ones.
+        generator = np.random.default_rng([draw, zlib.crc32(scene.name.encode())])
+        chosen = generator.choice(len(candidates), count, replace=False)
+        found.append(candidates[np.sort(chosen)] + first)
+    return torch.cat(found)

@@ -1,0 +1,157 @@
+"""Where episodes begin: uniformly over the states that can reach the goal in more than 0 steps.
+
+The states that can reach a goal are the ancestors of its strongly connected component, so all goals of one
+component share one list, and a room without one-way doors needs a single list for all its goals: memory grows
+with the number of states, not with its square. Drawing a start is then a draw of an index into the list that
+skips the goal itself.
+
+Drawing is pure: random integers go in, states come out. Whoever holds the generator draws the integers, from
+0..2**62-1; taking them modulo a count below 2**24 is uniform to within 1e-11.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from vusfa.errors import GoalError
+from vusfa.scenes.graph import steps_to_goals, strong_components
+
+__all__ = ["DRAW_LIMIT", "GoalTable", "StartTable", "draw_goals", "draw_starts", "start_table"]
+
+DRAW_LIMIT = 2**62
+
+
+class GoalTable(NamedTuple):
+    """Facts about goals, one entry a goal (G,), or one a row (*B,) once looked up with :meth:`take`; all
+    int64.
+
+    Attributes:
+        goal: global state id.
+        scene: index of its scene.
+        first: where the list of its starts begins in :attr:`StartTable.members`.
+        starts: number of states an episode can begin at.
+        rank: the goal's own position in its list, to be skipped.
+    """
+
+    goal: Tensor
+    scene: Tensor
+    first: Tensor
+    starts: Tensor
+    rank: Tensor
+
+    def take(self, slot: Tensor) -> GoalTable:
+        """The entries of some goals, by their position in the table."""
+        return GoalTable(*(column[slot] for column in self))
+
+
+class StartTable(NamedTuple):
+    """All that a sampler of episodes needs.
+
+    Attributes:
+        goals: the goals, in the order given.
+        members: (M,) int64, global ids, for each distinct set of starts one sorted list.
+        order: (G,) int64, positions of the goals, scene by scene.
+        scene_first, scene_goals: (K,) int64, for the K scenes that have goals: where its goals begin in
+            ``order``, and how many they are.
+    """
+
+    goals: GoalTable
+    members: Tensor
+    order: Tensor
+    scene_first: Tensor
+    scene_goals: Tensor
+
+
+def start_table(graphs: Sequence[Tensor], offsets: Tensor, goals: Tensor, names: Sequence[str]) -> StartTable:
+    """Find the starts of every goal.
+
+    Args:
+        graphs: for each scene (N, A) integers, -1 = blocked.
+        offsets: (n_scenes + 1,) int64, the global id of each scene's first state.
+        goals: (G,) int64 global ids, G at least 1; a goal may occur several times.
+        names: for each scene its name, for the message.
+
+    Raises:
+        GoalError: no other state can reach a goal.
+
+    >>> corridor = torch.tensor([[1, -1], [2, 0], [-1, 1]])  # right, left
+    >>> table = start_table([corridor], torch.tensor([0, 3]), torch.tensor([1]), ["corridor"])
+    >>> draw_starts(table.members, table.goals.take(torch.tensor([0, 0])), torch.tensor([10, 11])).tolist()
+    [0, 2]
+    """
+    scene = torch.bucketize(goals, offsets, right=True) - 1
+    first, starts, rank = (torch.zeros_like(goals) for _ in range(3))
+    lists: list[Tensor] = []
+    length = 0
+    for index in scene.unique().tolist():
+        of_scene = (scene == index).nonzero()[:, 0]
+        offset = int(offsets[index])
+        local = goals[of_scene] - offset
+        component = _component_of_state(graphs[index])
+        for label in component[local].unique().tolist():
+            slot = of_scene[component[local] == label]
+            target = goals[slot] - offset
+            reaching = (steps_to_goals(graphs[index], int(target[0]))[0] >= 0).nonzero()[:, 0]
+            if len(reaching) == 1:
+                raise GoalError(
+                    f"scene {names[index]!r}: no other state can reach goal {int(target[0])}"
+                    f" (global id {int(goals[slot[0]])}); choose another goal, or look at the scene's islands"
+                )
+            first[slot] = length
+            starts[slot] = len(reaching) - 1
+            rank[slot] = torch.searchsorted(reaching, target)
+            lists.append(reaching + offset)
+            length += len(reaching)
+    order = torch.argsort(scene, stable=True)
+    _, scene_goals = scene.unique(return_counts=True)
+    return StartTable(
+        goals=GoalTable(goal=goals, scene=scene, first=first, starts=starts, rank=rank),
+        members=torch.cat(lists),
+        order=order,
+        scene_first=scene_goals.cumsum(0) - scene_goals,
+        scene_goals=scene_goals,
+    )
+
+
+def _component_of_state(graph: Tensor) -> Tensor:
+    """Label of each state's strongly connected component, (N,)."""
+    label = torch.empty(len(graph), dtype=torch.int64)
+    for index, states in enumerate(strong_components(graph)):
+        label[torch.tensor(states)] = index
+    return label
+
+
+def draw_starts(members: Tensor, goals: GoalTable, draw: Tensor) -> Tensor:
+    """Turn random integers into starts.
+
+    Args:
+        members: (M,), of the :class:`StartTable`.
+        goals: the goal of each row, columns (*B,).
+        draw: (*B,) int64, uniform over 0..DRAW_LIMIT-1.
+
+    Returns:
+        (*B,) int64 global ids, never the goal, always able to reach it.
+    """
+    index = draw % goals.starts
+    index = index + (index >= goals.rank)
+    return members[goals.first + index]
+
+
+def draw_goals(table: StartTable, scene_draw: Tensor, goal_draw: Tensor) -> GoalTable:
+    """Turn random integers into goals: uniform over the scenes that have any, then over the scene's goals.
+
+    Args:
+        table: the sampler's table.
+        scene_draw: (*B,) int64, uniform over 0..DRAW_LIMIT-1.
+        goal_draw: the same, drawn independently.
+
+    Returns:
+        the goals' facts, columns (*B,).
+    """
+    scene = scene_draw % len(table.scene_goals)
+    position = table.scene_first[scene] + goal_draw % table.scene_goals[scene]
+    return table.goals.take(table.order[position])
