@@ -1,0 +1,106 @@
+"""The variational siamese bottleneck: embeddings become Gaussians, and omega reads a sample of the goal's.
+
+The encoder gives mean and scale of z for state and goal. pi and psi read the means; omega reads z_g = mean
++ scale * eps while training. How much z may say is held by the KL term of :class:`vusfa.objectives.USFLoss`.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Literal
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from vusfa.errors import ConfigError
+from vusfa.modules.siamese import SiameseEncoder
+
+__all__ = ["GaussianEncoder", "LatentSampler"]
+
+
+class GaussianEncoder(nn.Module):
+    """A siamese encoder whose code of size 2 E is the mean and the scale of a Gaussian of size E.
+
+    Args:
+        encoder: siamese encoder with ``out_features = 2 E``.
+        scale: ``"softplus"``: ``softplus`` of the second half, positive. ``"raw"``: the second half as it
+            is, of either sign, as in the released code.
+        initial_scale: what the scale starts near, by the bias of its layer; ``"softplus"`` only. ``None``
+            leaves the bias as it is drawn: near log 2.
+
+    Raises:
+        ConfigError: ``initial_scale`` with ``"raw"``, or not positive.
+
+    >>> from vusfa.modules.frames import FeatureFrames
+    >>> encoder = SiameseEncoder(FeatureFrames(torch.rand(12, 1, 8)), 4, 16, 2 * 6)
+    >>> gaussian, state_id = GaussianEncoder(encoder, initial_scale=0.1), torch.zeros(3, 4, dtype=torch.int64)
+    >>> *embeddings, state_loc, state_scale, goal_loc, goal_scale = gaussian(state_id, torch.arange(3))
+    >>> goal_scale.shape, bool((goal_scale > 0).all())
+    (torch.Size([3, 6]), True)
+    """
+
+    def __init__(
+        self,
+        encoder: SiameseEncoder,
+        scale: Literal["softplus", "raw"] = "softplus",
+        initial_scale: float | None = None,
+    ) -> None:
+        super().__init__()
+        if scale not in ("softplus", "raw"):
+            raise ConfigError(f"scale is {scale!r}; it must be 'softplus' or 'raw'")
+        self.encoder = encoder
+        self.scale = scale
+        if initial_scale is not None:
+            if scale == "raw" or initial_scale <= 0:
+                raise ConfigError(
+                    f"initial_scale is {initial_scale} with scale {scale!r};"
+                    " give a number above 0 with 'softplus', or None"
+                )
+            for branch in {encoder.branch, encoder.goal_branch or encoder.branch}:
+                last = branch.last
+                assert last is not None, "a Gaussian code comes from a linear second layer"
+                with torch.no_grad():
+                    last.bias[last.out_features // 2 :] = math.log(math.expm1(initial_scale))
+
+    def forward(self, state: Tensor, goal: Tensor) -> tuple[Tensor, ...]:
+        """Embeddings of state and goal, which are the means; then mean and scale of each; all (\\*B, E)."""
+        state_code, goal_code = self.encoder(state, goal)
+        state_loc, state_scale = self._gaussian(state_code)
+        goal_loc, goal_scale = self._gaussian(goal_code)
+        return state_loc, goal_loc, state_loc, state_scale, goal_loc, goal_scale
+
+    def _gaussian(self, code: Tensor) -> tuple[Tensor, Tensor]:
+        loc, scale = code.chunk(2, -1)
+        return loc, functional.softplus(scale) if self.scale == "softplus" else scale
+
+
+class LatentSampler(nn.Module):
+    """z = mean + scale * eps while training; in evaluation mode the mean, or a sample if asked for.
+
+    Deliberately a plain module and no distribution of TorchRL's: its losses switch every distribution to
+    its mean.
+
+    Args:
+        eval_latent: what evaluation mode gives, ``"mean"`` or ``"sample"``.
+
+    >>> sampler, loc, scale = LatentSampler(), torch.zeros(2, 3), torch.ones(2, 3)
+    >>> bool((sampler(loc, scale) == 0).any()), bool((sampler.eval()(loc, scale) == 0).all())
+    (False, True)
+    """
+
+    def __init__(self, eval_latent: Literal["mean", "sample"] = "mean") -> None:
+        super().__init__()
+        if eval_latent not in ("mean", "sample"):
+            raise ConfigError(f"eval_latent is {eval_latent!r}; it must be 'mean' or 'sample'")
+        self.eval_latent = eval_latent
+
+    def noise(self, loc: Tensor) -> Tensor:
+        """Draws eps, standard normal of the mean's shape, from torch's global generator."""
+        return torch.randn(loc.shape, dtype=loc.dtype, device=loc.device)
+
+    def forward(self, loc: Tensor, scale: Tensor) -> Tensor:
+        """z (\\*B, E) of means and scales (\\*B, E)."""
+        if self.training or self.eval_latent == "sample":
+            return loc + scale * self.noise(loc)
+        return loc

@@ -1,0 +1,150 @@
+"""From a state's id, or from what a camera saw there, to the features of one frame.
+
+Both classes answer two questions: ``lookup(ids)``, the features of states by id (no picture and no feature
+travels to get here), and ``encode(observation)``, the same features for whoever holds the observation itself.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from vusfa.errors import ConfigError
+
+__all__ = ["FeatureFrames", "PictureFrames", "shrink_pictures"]
+
+
+class FeatureFrames(nn.Module):
+    """Precomputed features of frames: a table of all states, crop 0.
+
+    The table is a buffer that moves with the module and stays out of its ``state_dict``: it belongs to the
+    scenes.
+
+    Args:
+        features: (S, C, F) float32 of all states, as in ``SceneSet.features``.
+        lookup: keep the table; ``False`` for an agent that is handed features.
+        normalise: bring every feature to mean 0 and deviation 1 over the S states. The 2 F numbers are
+            part of the ``state_dict``, because the weights behind them mean nothing with others.
+
+    >>> frames = FeatureFrames(torch.rand(12, 1, 8), normalise=True)
+    >>> frames.lookup(torch.tensor([[3, 5]])).shape, len(frames.state_dict())
+    (torch.Size([1, 2, 8]), 2)
+    """
+
+    table: Tensor
+    mean: Tensor
+    deviation: Tensor
+
+    def __init__(self, features: Tensor, lookup: bool = True, normalise: bool = False) -> None:
+        super().__init__()
+        table = features[:, 0].to(torch.float32).contiguous()
+        self.size = table.shape[-1]
+        self.normalise = normalise
+        self.register_buffer("table", table if lookup else table[:0].clone(), persistent=False)
+        if normalise:
+            # A feature that never changes would be divided by nothing; it becomes 0 and stays out of the way.
+            self.register_buffer("mean", table.mean(0))
+            self.register_buffer("deviation", table.std(0, correction=0).clamp(min=1e-3))
+
+    @property
+    def num_states(self) -> int:
+        """S, or 0 without a table."""
+        return len(self.table)
+
+    def lookup(self, ids: Tensor | None) -> Tensor:
+        """Features (\\*B, F) of states (\\*B,) int64; of all S states in order for ``None``."""
+        return self.encode(self.table if ids is None else self.table[ids])
+
+    def encode(self, observation: Tensor) -> Tensor:
+        """Features (\\*B, F) as the encoder wants them, of features (\\*B, F) as the scene has them."""
+        return (observation - self.mean) / self.deviation if self.normalise else observation
+
+
+class PictureFrames(nn.Module):
+    """Features learned from pictures by three convolutions, the paper's variant "from scratch".
+
+    Pictures are shrunk to ``size`` first (once, for the table). Convolutions of 32 filters 8 x 8 by 4, 64
+    of 4 x 4 by 2 and 64 of 3 x 3 by 1, each with a ReLU, turn 60 x 80 pixels into 4 x 6 x 64 = 1536
+    features; the siamese encoder takes it from there.
+
+    Args:
+        pictures: (S, H, W, 3) uint8 of all states for an agent that looks them up, else ``None``.
+        picture_size: height and width that the convolutions see, pixels.
+
+    Raises:
+        ConfigError: pictures smaller than the convolutions need (36 x 36).
+
+    >>> frames = PictureFrames(torch.randint(0, 256, (5, 150, 200, 3), dtype=torch.uint8), (60, 80))
+    >>> frames.lookup(torch.tensor([4, 0])).shape
+    torch.Size([2, 1536])
+    """
+
+    table: Tensor
+
+    def __init__(self, pictures: Tensor | None, picture_size: tuple[int, int] = (60, 80)) -> None:
+        super().__init__()
+        self.picture_size = (int(picture_size[0]), int(picture_size[1]))
+        if min(self.picture_size) < 36:
+            raise ConfigError(
+                f"picture_size is {self.picture_size}; the convolutions need at least 36 x 36 pixels"
+            )
+        if pictures is None:
+            pictures = torch.empty(0, *self.picture_size, 3, dtype=torch.uint8)
+        table = shrink_pictures(pictures.movedim(-1, -3), self.picture_size).contiguous()
+        self.register_buffer("table", table, persistent=False)
+        self.convolutions = nn.Sequential(
+            nn.Conv2d(3, 32, 8, stride=4),
+            nn.ReLU(),
+            nn.Conv2d(32, 64, 4, stride=2),
+            nn.ReLU(),
+            nn.Conv2d(64, 64, 3, stride=1),
+            nn.ReLU(),
+            nn.Flatten(),
+        )
+        height, width = (((side - 8) // 4 + 1 - 4) // 2 + 1 - 2 for side in self.picture_size)
+        self.size = 64 * height * width
+
+    @property
+    def num_states(self) -> int:
+        """S, or 0 without a table."""
+        return len(self.table)
+
+    def lookup(self, ids: Tensor | None) -> Tensor:
+        """Features (\\*B, F) of states (\\*B,) int64; of all S states in order for ``None``."""
+        return self.encode(self.table if ids is None else self.table[ids])
+
+    def encode(self, observation: Tensor) -> Tensor:
+        """Features (\\*B, F) of pictures (\\*B, 3, H, W) uint8."""
+        batch = observation.shape[:-3]
+        small = shrink_pictures(observation.reshape(-1, *observation.shape[-3:]), self.picture_size)
+        # Centred, so that a dark picture and a light one start equally far from nothing.
+        return self.convolutions(small.to(torch.float32) / 127.5 - 1).view(*batch, self.size)
+
+
+def shrink_pictures(pictures: Tensor, size: tuple[int, int]) -> Tensor:
+    """Averages pictures (n, 3, H, W) uint8 down to (n, 3, *size) uint8.
+
+    Rounded to uint8 again, so that a table shrunk once and pictures shrunk on the way give the same numbers.
+
+    >>> shrink_pictures(torch.full((1, 3, 4, 4), 7, dtype=torch.uint8), (2, 2)).unique()
+    tensor([7], dtype=torch.uint8)
+    """
+    if tuple(pictures.shape[-2:]) == tuple(size):
+        return pictures
+    parts = [
+        functional.interpolate(part.to(torch.float32), size=size, mode="area").round().to(torch.uint8)
+        for part in pictures.split(64)
+    ]
+    return torch.cat(parts)
+
+
+def picture_table(scenes: Any) -> Tensor:
+    """All pictures (S, H, W, 3) uint8 of a ``SceneSet``, read from its files.
+
+    Raises:
+        SceneError: a scene has none, or the scenes' pictures differ in size.
+    """
+    return scenes.pictures(torch.arange(scenes.num_states))

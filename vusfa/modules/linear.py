@@ -1,0 +1,172 @@
+"""Affine layers that torch lacks: one weight a scene, and one weight a frame of a history.
+
+Both start as ``torch.nn.Linear`` does, uniform in +-1/sqrt(fan_in), which is also the rule of the paper's
+released code.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+__all__ = ["HistoryLinear", "SceneLinear"]
+
+#: At most this many outputs a row are computed for nothing before rows are sorted by scene instead.
+_DENSE_OUTPUTS = 64
+#: On an accelerator sorting means waiting for it, so a few scenes are all computed there.
+_DENSE_SCENES = 8
+
+
+class SceneLinear(nn.Module):
+    """An affine layer with weights of its own for each scene: row i meets those of scene ``scene_id[i]``.
+
+    Batches that mix scenes are sorted by scene, so that each scene costs one matrix product of its own
+    rows; small outputs (the logits) are computed for all scenes and picked, which is cheaper than sorting.
+    With one scene it is a plain ``linear``.
+
+    Args:
+        num_scenes: n.
+        in_features: size of an input row.
+        out_features: size of an output row.
+
+    Attributes:
+        weight: (n, out, in) float32.
+        bias: (n, out) float32.
+
+    >>> layer = SceneLinear(3, 8, 5)
+    >>> x, scene_id = torch.randn(4, 8), torch.tensor([2, 0, 2, 1])
+    >>> y = layer(x, scene_id)
+    >>> y.shape
+    torch.Size([4, 5])
+    >>> torch.allclose(y[0], x[0] @ layer.weight[2].T + layer.bias[2], atol=1e-6)
+    True
+    """
+
+    def __init__(self, num_scenes: int, in_features: int, out_features: int) -> None:
+        super().__init__()
+        self.num_scenes = num_scenes
+        self.in_features = in_features
+        self.out_features = out_features
+        self.weight = nn.Parameter(torch.empty(num_scenes, out_features, in_features))
+        self.bias = nn.Parameter(torch.empty(num_scenes, out_features))
+        self.reset_parameters()
+
+    def reset_parameters(self) -> None:
+        """Draws weights and biases anew, uniform in +-1/sqrt(in_features)."""
+        _uniform_(self.weight, self.bias, fan_in=self.in_features)
+
+    def forward(self, x: Tensor, scene_id: Tensor) -> Tensor:
+        """Maps (\\*B, in) with scene indices (\\*B,) int64 to (\\*B, out)."""
+        if self.num_scenes == 1:
+            return functional.linear(x, self.weight[0], self.bias[0])
+        rows, scene = x.reshape(-1, self.in_features), scene_id.reshape(-1)
+        if self.num_scenes * self.out_features <= _DENSE_OUTPUTS or (
+            rows.is_cuda and self.num_scenes <= _DENSE_SCENES
+        ):
+            result = self._all_scenes(rows, scene)
+        else:
+            result = self._by_scene(rows, scene)
+        return result.reshape(*x.shape[:-1], self.out_features)
+
+    def _all_scenes(self, rows: Tensor, scene: Tensor) -> Tensor:
+        every = functional.linear(rows, self.weight.flatten(0, 1), self.bias.flatten())
+        every = every.view(-1, self.num_scenes, self.out_features)
+        return every[torch.arange(len(rows), device=rows.device), scene]
+
+    def _by_scene(self, rows: Tensor, scene: Tensor) -> Tensor:
+        counts = torch.bincount(scene, minlength=self.num_scenes).tolist()
+        if max(counts) == len(rows):
+            only = counts.index(len(rows))
+            return functional.linear(rows, self.weight[only], self.bias[only])
+        order = scene.argsort(stable=True)
+        parts = [
+            functional.linear(part, self.weight[index], self.bias[index])
+            for index, part in enumerate(rows[order].split(counts))
+            if counts[index]
+        ]
+        back = torch.empty_like(order)
+        back[order] = torch.arange(len(order), device=order.device)
+        return torch.cat(parts)[back]
+
+    def extra_repr(self) -> str:
+        """What ``print`` shows of the layer."""
+        return f"scenes={self.num_scenes}, in_features={self.in_features}, out_features={self.out_features}"
+
+
+class HistoryLinear(nn.Module):
+    """An affine layer over the last H frames, kept as one weight a frame: ``sum_h W_h f_h + b``.
+
+    It is ``Linear(H * F, out)`` on the frames laid end to end. In this form the product of a frame with
+    each of the H weights is a thing of its own (:meth:`project`): a frame that turns up in many histories,
+    at any place, is multiplied once, and the histories are sums of what was looked up (:meth:`gather`).
+
+    Args:
+        history: H.
+        in_features: F, size of a frame's features.
+        out_features: size of the output.
+
+    Attributes:
+        weight: (H, out, F) float32; ``weight[h]`` belongs to frame h, oldest first.
+        bias: (out,) float32.
+
+    >>> layer = HistoryLinear(4, 6, 5)
+    >>> frames = torch.randn(10, 6)                                   # ten different frames
+    >>> history = torch.tensor([[3, 3, 3, 4], [3, 3, 4, 9]])          # two histories of four
+    >>> torch.allclose(layer(frames[history]), layer.gather(layer.project(frames), history), atol=1e-6)
+    True
+    """
+
+    def __init__(self, history: int, in_features: int, out_features: int) -> None:
+        super().__init__()
+        self.history = history
+        self.in_features = in_features
+        self.out_features = out_features
+        self.weight = nn.Parameter(torch.empty(history, out_features, in_features))
+        self.bias = nn.Parameter(torch.empty(out_features))
+        self.reset_parameters()
+
+    def reset_parameters(self) -> None:
+        """Draws weights and biases anew, uniform in +-1/sqrt(H * in_features)."""
+        _uniform_(self.weight, self.bias, fan_in=self.history * self.in_features)
+
+    def forward(self, frames: Tensor) -> Tensor:
+        """Maps histories (\\*B, H, F), oldest frame first, to (\\*B, out)."""
+        batch = frames.shape[:-2]
+        if self.history == 1:
+            return functional.linear(frames.squeeze(-2), self.weight[0], self.bias)
+        slots = frames.reshape(-1, self.history, self.in_features).transpose(0, 1)
+        return (torch.bmm(slots, self.weight.transpose(1, 2)).sum(0) + self.bias).view(*batch, -1)
+
+    def repeated(self, frame: Tensor) -> Tensor:
+        """Maps one frame (\\*B, F) that fills all H places to (\\*B, out)."""
+        return functional.linear(frame, self.weight.sum(0), self.bias)
+
+    def project(self, frames: Tensor) -> Tensor:
+        """Multiplies (D, F) frames with the weights of all places: (D, H, out), without the bias."""
+        return functional.linear(frames, self.weight.flatten(0, 1)).view(-1, self.history, self.out_features)
+
+    def gather(self, projected: Tensor, index: Tensor) -> Tensor:
+        """Histories as sums of projected frames.
+
+        Args:
+            projected: (D, H, out) from :meth:`project`.
+            index: (\\*B, H) int64 rows of ``projected``, oldest frame first.
+
+        Returns:
+            (\\*B, out), what :meth:`forward` gives on the frames themselves.
+        """
+        place = torch.arange(self.history, device=index.device)
+        return projected[index, place].sum(-2) + self.bias
+
+    def extra_repr(self) -> str:
+        """What ``print`` shows of the layer."""
+        return f"history={self.history}, in_features={self.in_features}, out_features={self.out_features}"
+
+
+def _uniform_(*tensors: Tensor, fan_in: int) -> None:
+    bound = 1 / math.sqrt(fan_in)
+    for tensor in tensors:
+        nn.init.uniform_(tensor, -bound, bound)

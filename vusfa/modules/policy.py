@@ -1,0 +1,92 @@
+"""Policy heads: hidden state to logits.
+
+Successor feature dependent policy (SFDP): the head of SFDP and VUSFA reads psi(s, g) beside the hidden
+state, and reads it as a constant. The policy's gradient must not bend psi away from what it predicts, so
+psi is detached, here and nowhere else.
+"""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from vusfa.errors import ConfigError
+from vusfa.modules.linear import SceneLinear
+
+__all__ = ["PolicyHead", "SuccessorPolicyHead"]
+
+
+class PolicyHead(nn.Module):
+    """One linear layer a scene: hidden state to logits (GVF and USFA).
+
+    >>> PolicyHead(2, 32, 4)(torch.randn(5, 32), torch.tensor([0, 1, 1, 0, 1])).shape
+    torch.Size([5, 4])
+    """
+
+    def __init__(self, num_scenes: int, hidden_size: int, num_actions: int) -> None:
+        super().__init__()
+        self.linear = SceneLinear(num_scenes, hidden_size, num_actions)
+
+    def forward(self, hidden: Tensor, scene_id: Tensor) -> Tensor:
+        """(\\*B, hidden_size) with scene indices (\\*B,) to logits (\\*B, A) float32."""
+        return self.linear(hidden, scene_id).float()
+
+
+class SuccessorPolicyHead(nn.Module):
+    """[hidden, psi] through a dense layer with ReLU, then a linear one, both a scene's own (SFDP and VUSFA).
+
+    Args:
+        num_scenes: scenes with weights of their own.
+        hidden_size: size of the hidden state and of the dense layer.
+        embedding_size: E, size of psi.
+        num_actions: A.
+        successor_norm: psi grows with the horizon (the sum of about 1 / (1 - gamma) embeddings) and drifts
+            as they do. ``"rms"`` divides it by its root mean square, ``"layer"`` takes its mean away as
+            well, ``None`` leaves it.
+        successor_gain: factor on psi, after that.
+        rectify_logits: a ReLU on the logits, as in the released VUSFA.
+
+    >>> head = SuccessorPolicyHead(1, 32, 16, 4, successor_norm="rms")
+    >>> psi = torch.randn(5, 16, requires_grad=True)
+    >>> head(torch.randn(5, 32), psi, torch.zeros(5, dtype=torch.int64)).sum().backward()
+    >>> psi.grad is None
+    True
+    """
+
+    def __init__(
+        self,
+        num_scenes: int,
+        hidden_size: int,
+        embedding_size: int,
+        num_actions: int,
+        *,
+        successor_norm: Literal["rms", "layer"] | None = None,
+        successor_gain: float = 1.0,
+        rectify_logits: bool = False,
+    ) -> None:
+        super().__init__()
+        if successor_norm not in (None, "rms", "layer"):
+            raise ConfigError(f"successor_norm is {successor_norm!r}; it must be None, 'rms' or 'layer'")
+        self.first = SceneLinear(num_scenes, hidden_size + embedding_size, hidden_size)
+        self.last = SceneLinear(num_scenes, hidden_size, num_actions)
+        self.successor_norm = successor_norm
+        self.successor_gain = successor_gain
+        self.rectify_logits = rectify_logits
+
+    def forward(self, hidden: Tensor, successor: Tensor, scene_id: Tensor) -> Tensor:
+        """(\\*B, hidden_size), psi (\\*B, E) and scene indices (\\*B,) to logits (\\*B, A) float32."""
+        constant = self._scaled(successor.detach())
+        code = functional.relu(self.first(torch.cat([hidden, constant.to(hidden.dtype)], -1), scene_id))
+        logits = self.last(code, scene_id).float()
+        return functional.relu(logits) if self.rectify_logits else logits
+
+    def _scaled(self, successor: Tensor) -> Tensor:
+        shape = successor.shape[-1:]
+        if self.successor_norm == "rms":
+            successor = functional.rms_norm(successor, shape, eps=1e-6)
+        elif self.successor_norm == "layer":
+            successor = functional.layer_norm(successor, shape, eps=1e-6)
+        return successor * self.successor_gain

@@ -1,0 +1,206 @@
+"""What the four models are, and what the three presets make of the rest: two tables and the class they fill.
+
+The models differ in three named ideas (:data:`MODELS`). Everything else is a field of
+:class:`AgentConfig`, which a preset sets (:data:`PRESETS`) and ``make_agent(..., field=value)`` overrides.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+from collections.abc import Iterable
+from typing import Any, Literal, NamedTuple
+
+from vusfa.errors import ConfigError
+
+__all__ = ["MODELS", "PRESETS", "AgentConfig", "Model", "resolve_config"]
+
+
+class Model(NamedTuple):
+    """The ideas that a model has.
+
+    Attributes:
+        successor_value: V = psi . omega instead of a linear value head.
+        successor_policy: SFDP: the policy reads (detached) psi too.
+        bottleneck: embeddings are Gaussians, omega reads a sample of the goal's.
+    """
+
+    successor_value: bool
+    successor_policy: bool
+    bottleneck: bool
+
+
+#: The four models of the paper's Table 1.
+MODELS: dict[str, Model] = {
+    #             psi . omega  SFDP   bottleneck
+    "gvf": Model(False, False, False),
+    "usfa": Model(True, False, False),
+    "sfdp": Model(True, True, False),
+    "vusfa": Model(True, True, True),
+}
+
+#: What a preset sets, for all models (``"*"``) and then for one. What it leaves out has AgentConfig's
+#: default.
+PRESETS: dict[str, dict[str, dict[str, Any]]] = {
+    # The four models differ only in the ideas of MODELS, so that an ablation means something.
+    "controlled": {"*": {}, "vusfa": {"initial_scale": 0.1}},
+    # The paper's text. The GVF baseline is Zhu et al.'s, whose encoder is one layer. The text does not say
+    # how a scale is made; softplus keeps it positive.
+    "paper": {"*": {}, "gvf": {"embedding_layer": False}, "vusfa": {"eval_latent": "sample"}},
+    # The released code, quirks included.
+    "reference": {
+        "*": {},
+        "gvf": {"embedding_layer": False},
+        "usfa": {"shared_encoder": False},
+        "sfdp": {},
+        "vusfa": {"history": 1, "state_layer": True, "scale": "raw", "rectify_logits": True},
+    },
+}
+
+#: Fields that neither the paper nor its code knows: changing them would make those presets a lie.
+_OURS_ALONE = ("normalise_features", "successor_norm", "successor_gain", "initial_scale")
+
+
+@dataclasses.dataclass(frozen=True)
+class AgentConfig:
+    """All that shapes an agent, besides its scenes.
+
+    Attributes:
+        model: ``"gvf"``, ``"usfa"``, ``"sfdp"`` or ``"vusfa"``, see :data:`MODELS`.
+        preset: ``"controlled"``, ``"paper"`` or ``"reference"``, see :data:`PRESETS`.
+        history: frames H that the encoder reads. 1 with ``memory="lstm"`` unless given.
+        embedding_size: E, size of phi, psi and omega.
+        hidden_size: outputs of every other layer.
+        observation: what the agent reads: ``"index"`` (``state_id``, ``goal_id``), or ``"features"`` or
+            ``"pixels"`` (``observation``, ``goal_observation``).
+        encoder: ``"mlp"`` on precomputed features, or ``"conv"``: three convolutions on pictures. Fixed by
+            ``observation`` unless that is ``"index"``.
+        picture_size: height and width that the convolutions see, pixels.
+        normalise_features: bring each feature to mean 0, deviation 1 over the scenes' states.
+        shared_encoder: state and goal go through the same weights (siamese).
+        embedding_layer: a linear layer behind the encoder's first; without it E must equal ``hidden_size``.
+        state_layer: one more dense layer in the state's branch alone.
+        memory: ``"lstm"``: a recurrent layer behind the fusion of state and goal.
+        successor_norm: how psi is normalised on its way into the policy: ``None``, ``"rms"``, ``"layer"``.
+        successor_gain: factor on psi on that way.
+        rectify_logits: a ReLU on the logits.
+        scale: how the bottleneck makes a scale: ``"softplus"`` or ``"raw"``.
+        initial_scale: what the scale starts near; ``None``: as the layer is drawn.
+        eval_latent: what omega reads in evaluation mode: the ``"mean"`` of z_g or a ``"sample"``.
+    """
+
+    model: str
+    preset: str = "controlled"
+    history: int = 4
+    embedding_size: int = 512
+    hidden_size: int = 512
+    observation: Literal["index", "features", "pixels"] = "index"
+    encoder: Literal["mlp", "conv"] = "mlp"
+    picture_size: tuple[int, int] = (60, 80)
+    normalise_features: bool = False
+    shared_encoder: bool = True
+    embedding_layer: bool = True
+    state_layer: bool = False
+    memory: Literal["lstm"] | None = None
+    successor_norm: Literal["rms", "layer"] | None = None
+    successor_gain: float = 1.0
+    rectify_logits: bool = False
+    scale: Literal["softplus", "raw"] = "softplus"
+    initial_scale: float | None = None
+    eval_latent: Literal["mean", "sample"] = "mean"
+
+    @property
+    def ideas(self) -> Model:
+        """The model's row of :data:`MODELS`."""
+        return MODELS[self.model]
+
+
+def resolve_config(model: str, preset: str = "controlled", **overrides: Any) -> AgentConfig:
+    """The configuration of a model in a preset, with fields overridden.
+
+    Raises:
+        ConfigError: an unknown model, preset, field or value, naming it and what comes near; fields that
+            contradict each other; a field that the paper's presets do not have.
+
+    >>> config = resolve_config("vusfa", "reference")
+    >>> config.history, config.scale, config.state_layer
+    (1, 'raw', True)
+    >>> resolve_config("vusfa", histroy=1)
+    Traceback (most recent call last):
+    ...
+    vusfa.errors.ConfigError: make_agent knows no field 'histroy'; did you mean 'history'?
+    """
+    _check_choice("model", model, MODELS)
+    _check_choice("preset", preset, PRESETS)
+    fields = [field.name for field in dataclasses.fields(AgentConfig)][2:]
+    for name in overrides:
+        if name not in fields:
+            raise ConfigError(f"make_agent knows no field {name!r}; {_near(name, fields)}")
+    settings = {**PRESETS[preset]["*"], **PRESETS[preset].get(model, {})}
+    if preset != "controlled":
+        for name in _OURS_ALONE:
+            if overrides.get(name, settings.get(name, _default(name))) != settings.get(name, _default(name)):
+                raise ConfigError(
+                    f"{name} is no part of preset {preset!r}; use preset='controlled' to change it"
+                )
+    if overrides.get("observation", "index") == "pixels":
+        settings["encoder"] = "conv"
+    if overrides.get("memory") is not None:
+        settings["history"] = 1
+    settings.update(overrides)
+    if "picture_size" in settings:
+        settings["picture_size"] = tuple(int(side) for side in settings["picture_size"])
+    return _checked(AgentConfig(model=model, preset=preset, **settings))
+
+
+def _checked(config: AgentConfig) -> AgentConfig:
+    for name, choices in (
+        ("observation", ("index", "features", "pixels")),
+        ("encoder", ("mlp", "conv")),
+        ("memory", (None, "lstm")),
+        ("successor_norm", (None, "rms", "layer")),
+        ("scale", ("softplus", "raw")),
+        ("eval_latent", ("mean", "sample")),
+    ):
+        _check_choice(name, getattr(config, name), choices)
+    for name in ("history", "embedding_size", "hidden_size"):
+        value = getattr(config, name)
+        if not isinstance(value, int) or isinstance(value, bool) or value < 1:
+            raise ConfigError(f"{name} is {value!r}; it must be a whole number of 1 or more")
+    if (config.observation, config.encoder) in (("features", "conv"), ("pixels", "mlp")):
+        raise ConfigError(
+            f"observation {config.observation!r} does not go with encoder {config.encoder!r};"
+            " convolutions read 'pixels' or 'index', the mlp reads 'features' or 'index'"
+        )
+    if config.encoder == "conv" and config.normalise_features:
+        raise ConfigError(
+            "normalise_features is for precomputed features; the conv encoder has none, leave it out"
+        )
+    if not config.embedding_layer:
+        if config.ideas.bottleneck:
+            raise ConfigError(
+                "embedding_layer is False, but the bottleneck's mean and scale come from that layer"
+            )
+        if config.embedding_size != config.hidden_size:
+            raise ConfigError(
+                f"embedding_size is {config.embedding_size} and hidden_size {config.hidden_size};"
+                " without embedding_layer they must be equal"
+            )
+    return config
+
+
+def _default(name: str) -> Any:
+    return AgentConfig.__dataclass_fields__[name].default
+
+
+def _check_choice(what: str, value: Any, choices: Iterable[Any]) -> None:
+    if value not in choices:
+        raise ConfigError(f"{what} is {value!r}; {_near(value, choices)}")
+
+
+def _near(value: Any, choices: Iterable[Any]) -> str:
+    names = [str(choice) for choice in choices]
+    found = difflib.get_close_matches(str(value), names, n=3)
+    if found:
+        return f"did you mean {' or '.join(map(repr, found))}?"
+    return f"it must be one of {', '.join(map(repr, names))}"

@@ -1,0 +1,88 @@
+"""Universal successor features: psi, omega, and the value they make.
+
+psi(s, g) is the discounted sum of the embeddings to come, omega(g) what each dimension of them is worth on
+the way to g, and V(s, g) = psi(s, g) . omega(g) (arXiv 1908.06376, section 3).
+"""
+
+from __future__ import annotations
+
+from torch import Tensor, nn
+from torch.nn import functional
+
+from vusfa.modules.linear import SceneLinear
+
+__all__ = ["RewardHead", "SuccessorHead", "SuccessorValue", "ValueHead"]
+
+
+class SuccessorHead(nn.Module):
+    """psi: one linear layer a scene on the hidden state.
+
+    Args:
+        num_scenes: scenes with weights of their own.
+        hidden_size: size of the hidden state.
+        embedding_size: E, size of psi.
+
+    >>> import torch
+    >>> SuccessorHead(2, 32, 16)(torch.randn(5, 32), torch.tensor([0, 1, 1, 0, 1])).shape
+    torch.Size([5, 16])
+    """
+
+    def __init__(self, num_scenes: int, hidden_size: int, embedding_size: int) -> None:
+        super().__init__()
+        self.linear = SceneLinear(num_scenes, hidden_size, embedding_size)
+
+    def forward(self, hidden: Tensor, scene_id: Tensor) -> Tensor:
+        """(\\*B, hidden_size) with scene indices (\\*B,) to (\\*B, E) float32."""
+        return self.linear(hidden, scene_id).float()
+
+
+class RewardHead(nn.Module):
+    """omega: what the goal makes each dimension of psi worth; a dense layer with ReLU, then a linear one.
+
+    Args:
+        embedding_size: E, size of the goal's embedding and of omega.
+        hidden_size: outputs of the first layer.
+
+    >>> import torch
+    >>> RewardHead(16, 32)(torch.randn(5, 16)).shape
+    torch.Size([5, 16])
+    """
+
+    def __init__(self, embedding_size: int, hidden_size: int) -> None:
+        super().__init__()
+        self.first = nn.Linear(embedding_size, hidden_size)
+        self.last = nn.Linear(hidden_size, embedding_size)
+
+    def forward(self, goal: Tensor) -> Tensor:
+        """Goal embedding, or a sample of it, (\\*B, E) to (\\*B, E) float32."""
+        return self.last(functional.relu(self.first(goal))).float()
+
+
+class SuccessorValue(nn.Module):
+    """V = psi . omega; no parameters.
+
+    >>> import torch
+    >>> SuccessorValue()(torch.tensor([[1.0, 2.0]]), torch.tensor([[3.0, -1.0]]))
+    tensor([[1.]])
+    """
+
+    def forward(self, successor_features: Tensor, reward_weights: Tensor) -> Tensor:
+        """(\\*B, E) twice to (\\*B, 1)."""
+        return (successor_features * reward_weights).sum(-1, keepdim=True)
+
+
+class ValueHead(nn.Module):
+    """V of the GVF baseline: one linear layer a scene on the hidden state.
+
+    >>> import torch
+    >>> ValueHead(2, 32)(torch.randn(5, 32), torch.tensor([0, 1, 1, 0, 1])).shape
+    torch.Size([5, 1])
+    """
+
+    def __init__(self, num_scenes: int, hidden_size: int) -> None:
+        super().__init__()
+        self.linear = SceneLinear(num_scenes, hidden_size, 1)
+
+    def forward(self, hidden: Tensor, scene_id: Tensor) -> Tensor:
+        """(\\*B, hidden_size) with scene indices (\\*B,) to (\\*B, 1) float32."""
+        return self.linear(hidden, scene_id).float()
