@@ -1,16 +1,18 @@
 """What can be wrong with a scene's numbers, said so that it can be mended.
 
-Pure functions of arrays, each of which gives a list of faults: one line per kind of fault, naming the dataset, the
-first state concerned and how many there are. An empty list means that the scene can be used. Islands (states that
-some others cannot reach) are no fault; :attr:`vusfa.scenes.Scene.islands` reports them.
+Pure functions of arrays, each of which gives a list of faults: one line per kind of fault, naming the
+dataset, the first state concerned and how many there are. An empty list means that the scene can be used.
+Islands (states that some others cannot reach) are no fault; :attr:`vusfa.scenes.Scene.islands` reports them.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import os
+from collections.abc import Collection, Mapping, Sequence
 
 import numpy as np
 
+from vusfa.errors import SceneError
 from vusfa.scenes.graph import shortest_path_distances
 
 __all__ = [
@@ -20,90 +22,86 @@ __all__ = [
     "feature_faults",
     "graph_faults",
     "pose_faults",
-    "shape_faults",
+    "raise_faults",
+    "shape_fault",
 ]
 
-#: The datasets that a scene must have, with their shapes. N states, A actions, C crops, F features.
-DATASETS = {
-    "graph": "(N, A)",
-    "resnet_feature": "(N, C, F)",
-    "location": "(N, 2)",
-    "rotation": "(N,)",
-    "shortest_path_distance": "(N, N)",
+#: What a scene consists of: shape, kinds of dtype, and their name. N states, A actions, C crops, F features.
+DATASETS: dict[str, tuple[str, str, str]] = {
+    "graph": ("(N, A)", "iu", "integers"),
+    "resnet_feature": ("(N, C, F)", "f", "floats"),
+    "location": ("(N, 2)", "fiu", "numbers"),
+    "rotation": ("(N,)", "fiu", "numbers"),
+    "shortest_path_distance": ("(N, N)", "iu", "integers"),
 }
 
-_KINDS = {
-    "graph": ("iu", "integers"),
-    "resnet_feature": ("f", "floats"),
-    "location": ("fiu", "numbers"),
-    "rotation": ("fiu", "numbers"),
-    "shortest_path_distance": ("iu", "integers"),
-}
+
+def raise_faults(source: str | os.PathLike[str], faults: Sequence[str]) -> None:
+    """Raise one SceneError that lists all faults of a scene; do nothing where there are none.
+
+    >>> raise_faults("room.h5", ["dataset 'graph' is missing", "dataset 'location' is missing"])
+    Traceback (most recent call last):
+    ...
+    vusfa.errors.SceneError: room.h5: 2 faults
+      - dataset 'graph' is missing
+      - dataset 'location' is missing
+    """
+    if len(faults) == 1:
+        raise SceneError(f"{source}: {faults[0]}")
+    if faults:
+        lines = "".join(f"\n  - {fault}" for fault in faults)
+        raise SceneError(f"{source}: {len(faults)} faults{lines}")
 
 
 def _how_many(count: int) -> str:
     return "" if count == 1 else f" (the first of {count})"
 
 
-def shape_faults(shapes: Mapping[str, tuple[int, ...]], dtypes: Mapping[str, np.dtype]) -> list[str]:
-    """Datasets that are missing, or have a dtype or a shape that does not fit.
+def shape_fault(name: str, values: np.ndarray, num_states: int) -> str | None:
+    """The fault of a dataset whose dtype or shape does not fit; None when they do.
 
     Args:
-        shapes: shape of each dataset there is.
-        dtypes: dtype of each dataset there is.
+        name: one of :data:`DATASETS`.
+        values: the dataset.
+        num_states: N, as the graph has it.
 
-    >>> shape_faults({"graph": (3, 4)}, {"graph": np.dtype("float32")})[0]
-    "dataset 'graph' holds float32; write it as integers (N, A)"
+    >>> shape_fault("graph", np.zeros((3, 4), np.float32), 3)
+    "dataset 'graph' holds float32 of shape (3, 4); write it as integers (N, A)"
     """
-    faults = []
-    num_states = _number_of_states(shapes)
-    for name, wanted in DATASETS.items():
-        if name not in shapes:
-            faults.append(f"dataset {name!r} is missing; write it as {_KINDS[name][1]} {wanted}")
-            continue
-        shape = tuple(shapes[name])
-        if dtypes[name].kind not in _KINDS[name][0]:
-            faults.append(f"dataset {name!r} holds {dtypes[name]}; write it as {_KINDS[name][1]} {wanted}")
-        if len(shape) != wanted.count(",") + (not wanted.endswith(",)")):
-            faults.append(f"dataset {name!r} has shape {shape}; write it as {wanted}")
-        elif 0 in shape:
-            faults.append(f"dataset {name!r} has shape {shape}, which is empty; write it as {wanted}")
-        elif shape[0] != num_states:
-            faults.append(
-                f"dataset {name!r} has shape {shape}, of {shape[0]} states where the graph has {num_states};"
-                f" write one entry per state, {wanted}"
-            )
-        elif (name == "location" and shape[1] != 2) or (
-            name == "shortest_path_distance" and shape[1] != shape[0]
-        ):
-            faults.append(f"dataset {name!r} has shape {shape}; write it as {wanted}")
-    return faults
-
-
-def _number_of_states(shapes: Mapping[str, tuple[int, ...]]) -> int | None:
-    """As the graph has it, or else the first dataset that can tell."""
-    return next((shapes[name][0] for name in DATASETS if name in shapes and shapes[name]), None)
+    shape, kinds, kinds_name = DATASETS[name]
+    fits = values.dtype.kind in kinds and values.ndim == len(shape.strip("()").rstrip(",").split(","))
+    if fits and name in ("location", "shortest_path_distance"):
+        fits = values.shape[1] == (2 if name == "location" else values.shape[0])
+    if not fits or not values.size:
+        held = f"holds {values.dtype} of shape {values.shape}" if values.size else f"is empty, {values.shape}"
+        return f"dataset {name!r} {held}; write it as {kinds_name} {shape}"
+    if len(values) != num_states:
+        return (
+            f"dataset {name!r} has {len(values)} states, but the graph has {num_states}; write one entry"
+            f" per state, {shape}"
+        )
+    return None
 
 
 def graph_faults(graph: np.ndarray, actions: Sequence[str] | None = None) -> list[str]:
-    """Successors that are neither a state nor -1, and actions that do not fit the columns.
+    """Successors that are neither a state nor -1, and names of actions that do not fit the columns.
 
-    >>> graph_faults(np.array([[1, -1], [7, 0]]))
-    ["dataset 'graph', state 1: action 0 leads to 7, but the states are 0..1 and -1 is a blocked move; correct it"]
+    >>> graph_faults(np.array([[1, -1], [7, 0]]))[0]
+    "dataset 'graph', state 1: action 0 leads to 7, but states are 0..1 (-1 is a blocked move); correct it"
     """
     faults = []
     num_states, num_actions = graph.shape
     if actions is not None and len(actions) != num_actions:
         faults.append(
-            f"attribute 'actions' names {len(actions)} actions, but dataset 'graph' has {num_actions} columns;"
-            f" name every action, or leave the attribute out"
+            f"attribute 'actions' names {len(actions)} actions, but dataset 'graph' has {num_actions}"
+            f" columns; name every action, or leave the attribute out"
         )
     wrong = np.argwhere((graph < -1) | (graph >= num_states))
     if len(wrong):
         state, action = (int(i) for i in wrong[0])
         faults.append(
-            f"dataset 'graph', state {state}{_how_many(len(wrong))}: action {action} leads to {graph[state, action]},"
-            f" but the states are 0..{num_states - 1} and -1 is a blocked move; correct it"
+            f"dataset 'graph', state {state}{_how_many(len(wrong))}: action {action} leads to"
+            f" {graph[state, action]}, but states are 0..{num_states - 1} (-1 is a blocked move); correct it"
         )
     return faults
 
@@ -127,22 +125,26 @@ def feature_faults(features: np.ndarray) -> list[str]:
 
 
 def pose_faults(name: str, values: np.ndarray) -> list[str]:
-    """Locations (metres) or rotations (degrees) that are NaN or infinite."""
+    """Locations (metres) or rotations (degrees) that are NaN or infinite.
+
+    >>> pose_faults("rotation", np.array([0.0, np.nan, np.inf]))
+    ["dataset 'rotation', state 1 (the first of 2): nan is not finite; give every state a pose"]
+    """
     wrong = np.flatnonzero(~np.isfinite(values.reshape(len(values), -1)).all(axis=1))
     if not len(wrong):
         return []
+    state = int(wrong[0])
     return [
-        f"dataset {name!r}, state {wrong[0]}{_how_many(len(wrong))}: {values[wrong[0]].tolist()} is not finite;"
+        f"dataset {name!r}, state {state}{_how_many(len(wrong))}: {values[state].tolist()} is not finite;"
         f" give every state a pose"
     ]
 
 
 def distance_faults(graph: np.ndarray, distance: np.ndarray) -> list[str]:
-    """Distances that disagree with a breadth-first search of the graph.
+    """Distances that disagree with a breadth-first search of the graph: the first pair, and how many.
 
-    >>> graph = np.array([[1], [-1]])
-    >>> distance_faults(graph, np.array([[0, 2], [-1, 0]]))[0][:82]
-    "dataset 'shortest_path_distance', state 0 to state 1: 2, but the graph's is 1; rep"
+    >>> distance_faults(np.array([[1], [-1]]), np.array([[0, 2], [-1, 0]]))[0].split(";")[0]
+    "dataset 'shortest_path_distance', state 0 to state 1: 2, but by the graph it is 1"
     """
     found = shortest_path_distances(graph).numpy()
     wrong = np.argwhere(found != distance)
@@ -151,29 +153,47 @@ def distance_faults(graph: np.ndarray, distance: np.ndarray) -> list[str]:
     start, goal = (int(i) for i in wrong[0])
     return [
         f"dataset 'shortest_path_distance', state {start} to state {goal}{_how_many(len(wrong))}:"
-        f" {distance[start, goal]}, but the graph's is {found[start, goal]}; replace the dataset by"
-        f" vusfa.scenes.graph.shortest_path_distances(graph)"
+        f" {distance[start, goal]}, but by the graph it is {found[start, goal]}; correct the graph, or"
+        f" replace the dataset by vusfa.scenes.graph.shortest_path_distances(graph)"
     ]
 
 
-def array_faults(arrays: Mapping[str, np.ndarray], actions: Sequence[str] | None = None) -> list[str]:
-    """All faults of a scene's arrays at once: shapes first, then the values of those whose shape is right.
+def array_faults(
+    arrays: Mapping[str, np.ndarray],
+    actions: Sequence[str] | None = None,
+    optional: Collection[str] = (),
+) -> list[str]:
+    """All faults of a scene's arrays at once; values are looked at where the shapes allow it.
 
     Args:
-        arrays: the datasets by their THOR names; some may be missing, which is a fault.
+        arrays: the datasets of :data:`DATASETS` by name.
         actions: names of the graph's columns, where they are given.
+        optional: datasets that may be missing without fault.
+
+    >>> array_faults({"graph": np.zeros((2, 1), int)}, optional=["location", "rotation", "resnet_feature"])
+    ["dataset 'shortest_path_distance' is missing; write it as integers (N, N)"]
     """
-    faults = shape_faults({k: v.shape for k, v in arrays.items()}, {k: v.dtype for k, v in arrays.items()})
-    sound = {name for name in arrays if not any(f"dataset {name!r}" in fault for fault in faults)}
+    faults = []
+    sound = {}
+    # Should the graph itself be unusable, the first dataset there is tells how many states there are.
+    num_states = next((len(arrays[name]) for name in DATASETS if name in arrays and arrays[name].ndim), 0)
+    for name, (shape, _, kinds_name) in DATASETS.items():
+        if name in arrays:
+            fault = shape_fault(name, arrays[name], num_states)
+            if fault is None:
+                sound[name] = arrays[name]
+            else:
+                faults.append(fault)
+        elif name not in optional:
+            faults.append(f"dataset {name!r} is missing; write it as {kinds_name} {shape}")
     if "graph" in sound:
-        of_graph = graph_faults(arrays["graph"], actions)
-        faults += of_graph
-        # Without a sound graph there is nothing that the distances could be checked against.
-        if "shortest_path_distance" in sound and not any("dataset 'graph'," in f for f in of_graph):
-            faults += distance_faults(arrays["graph"], arrays["shortest_path_distance"])
+        faults += graph_faults(sound["graph"], actions)
+        # A graph that leads out of the room cannot be searched.
+        if "shortest_path_distance" in sound and not graph_faults(sound["graph"]):
+            faults += distance_faults(sound["graph"], sound["shortest_path_distance"])
     if "resnet_feature" in sound:
-        faults += feature_faults(arrays["resnet_feature"])
+        faults += feature_faults(sound["resnet_feature"])
     for name in ("location", "rotation"):
         if name in sound:
-            faults += pose_faults(name, arrays[name])
+            faults += pose_faults(name, sound[name])
     return faults

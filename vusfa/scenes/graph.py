@@ -1,11 +1,11 @@
 """What can be known exactly about a room's graph: shortest paths, components, success of a walk.
 
-A graph is an integer table of shape ``(N, A)``: ``graph[s, a]`` is the state that action ``a`` leads to from state
-``s``, or -1 when the move is blocked, in which case the agent stays where it is and the action counts all the same.
-Everything here is a pure function of such a table (a tensor or a NumPy array) and answers with tensors on the CPU.
+A graph is an integer table of shape ``(N, A)``: ``graph[s, a]`` is the state that action ``a`` leads to from
+state ``s``, or -1 when the move is blocked; the agent then stays where it is, and the action counts as any.
+Everything here is a pure function of such a table (a tensor or an array) and answers with tensors on the CPU.
 
-Success within ``steps`` actions needs no sampling. Make the goal absorbing; then the probability ``h_k(s)`` of having
-met it after at most ``k`` actions from ``s`` obeys
+Success within ``steps`` actions needs no sampling. Make the goal absorbing; then the probability ``h_k(s)``
+of having met it after at most ``k`` actions from ``s`` obeys
 
     h_0(s) = [s = g],    h_k(g) = 1,    h_k(s) = sum_a pi(a | s, g) h_{k-1}(next(s, a))
 
@@ -26,6 +26,7 @@ from vusfa.errors import GoalError
 
 __all__ = [
     "arrival_probability",
+    "default_actions",
     "policy_success",
     "random_walk_success",
     "shortest_path_distances",
@@ -36,8 +37,11 @@ __all__ = [
     "weak_components",
 ]
 
-# Rows of a dense (rows, N) float64 block that are worked on at a time: bounds memory, and keeps it in the cache.
-_BLOCK_ELEMENTS = 1 << 22
+# Searches give float64 tables: at most 32 MiB of them at a time.
+_SEARCH_ELEMENTS = 1 << 22
+# Elements of H that are propagated together: they stay in the cache, which is 3 to 5 times faster than all
+# goals at once. Where every goal has its own policy the transition matrix takes A more entries for each.
+_WALK_ELEMENTS = {2: 1 << 17, 3: 1 << 15}
 
 
 def _as_table(graph: Tensor | np.ndarray) -> np.ndarray:
@@ -75,12 +79,25 @@ def _breadth_first(edges: sparse.csr_matrix, sources: np.ndarray) -> np.ndarray:
     """Number of edges from each source to each state, (len(sources), N) int32, -1 where there is no path."""
     num_states = edges.shape[0]
     result = np.empty((len(sources), num_states), dtype=np.int32)
-    block = max(1, _BLOCK_ELEMENTS // max(num_states, 1))
+    block = max(1, _SEARCH_ELEMENTS // max(num_states, 1))
     for first in range(0, len(sources), block):
         rows = slice(first, first + block)
         found = csgraph.dijkstra(edges, indices=sources[rows], unweighted=True)
         result[rows] = np.where(np.isinf(found), -1, found)
     return result
+
+
+def default_actions(num_actions: int) -> tuple[str, ...]:
+    """Names for actions that have none: the THOR v1 dumps' four in their order, numbers for any other count.
+
+    >>> default_actions(4)
+    ('MoveForward', 'RotateRight', 'RotateLeft', 'MoveBackward')
+    >>> default_actions(2)
+    ('action_0', 'action_1')
+    """
+    if num_actions == 4:
+        return ("MoveForward", "RotateRight", "RotateLeft", "MoveBackward")
+    return tuple(f"action_{index}" for index in range(num_actions))
 
 
 def successor_table(graph: Tensor | np.ndarray) -> tuple[Tensor, Tensor]:
@@ -109,8 +126,8 @@ def shortest_path_distances(graph: Tensor | np.ndarray) -> Tensor:
         graph: (N, A) integers, -1 = blocked.
 
     Returns:
-        (N, N), ``[s, g]`` in actions, 0 on the diagonal and -1 where g cannot be reached from s; int16, or int32
-        where a path is longer than that holds.
+        (N, N), ``[s, g]`` in actions, 0 on the diagonal and -1 where g cannot be reached from s; int16, or
+        int32 where a path is longer than that holds.
 
     >>> shortest_path_distances(torch.tensor([[1, -1], [2, -1], [-1, -1]])).tolist()
     [[0, 1, 2], [-1, 0, 1], [-1, -1, 0]]
@@ -122,7 +139,7 @@ def shortest_path_distances(graph: Tensor | np.ndarray) -> Tensor:
 
 
 def steps_to_goals(graph: Tensor | np.ndarray, goals: Any) -> Tensor:
-    """Fewest actions from every state to each of some goals: a search backwards, cheap when the goals are few.
+    """Fewest actions from every state to some goals: a search backwards, cheap when the goals are few.
 
     Args:
         graph: (N, A) integers, -1 = blocked.
@@ -185,7 +202,8 @@ def _as_probabilities(
     if off.any():
         where = tuple(int(i) for i in np.argwhere(off)[0])
         raise ValueError(
-            f"action_probabilities at {where} is {probabilities[where].tolist()}: not a distribution (>= 0, sum 1)"
+            f"action_probabilities at {where} is {probabilities[where].tolist()}, not a distribution"
+            f" (each >= 0, sum 1)"
         )
     # Softmax in float32 sums to 1 within 1e-7; over 500 steps that would show in the sixth digit.
     return probabilities / probabilities.sum(-1, keepdims=True)
@@ -231,8 +249,8 @@ def arrival_probability(
 
     Args:
         graph: (N, A) integers, -1 = blocked (the agent stays, the action counts).
-        action_probabilities: (N, A), one policy for all goals, or (G, N, A), one for each. The policy must be a
-            function of the present state (and the goal) alone; with a history of frames it is not.
+        action_probabilities: (N, A), one policy for all goals, or (G, N, A), one for each. It must depend on
+            the present state alone: a policy that sees a history of frames has no exact success.
         goals: one state id, or (G,) of them.
         steps: actions allowed, 0 or more.
 
@@ -254,8 +272,7 @@ def arrival_probability(
     policy = _as_probabilities(action_probabilities, len(goal_ids), *table.shape)
     successor = successor_table(table)[0].numpy()
     walk = _walk_same_policy if policy.ndim == 2 else _walk_policy_per_goal
-    # Blocks of goals keep the vectors in the cache: 3 to 5 times faster than all goals in one product.
-    block = max(1, (1 << 15 if policy.ndim == 3 else 1 << 17) // max(len(table), 1))
+    block = max(1, _WALK_ELEMENTS[policy.ndim] // max(len(table), 1))
     parts = []
     for first in range(0, len(goal_ids), block):
         rows = slice(first, first + block)
@@ -268,14 +285,14 @@ def success_over_starts(
 ) -> Tensor:
     """Mean of ``arrived`` (G, N) over the starts that count, one number for each goal.
 
-    A start counts when it is not the goal itself and the goal can be reached from it in the graph; all those that
-    count weigh the same. Pairs that no policy could solve are thereby left out, not counted as failures.
+    A start counts when it is not the goal itself and the goal can be reached from it in the graph; all those
+    that count weigh the same. Pairs that no policy could solve are thereby left out, not counted as failures.
 
     Args:
         graph: (N, A) integers, -1 = blocked.
         arrived: (G, N), as :func:`arrival_probability` gives it.
         goals: one state id, or (G,) of them.
-        starts: state ids to choose from; None for all states.
+        starts: the set of state ids to choose from (repeats count once); None for all states.
 
     Returns:
         (G,) float64, NaN for a goal that no start can reach.
@@ -295,15 +312,15 @@ def policy_success(
 ) -> Tensor:
     """Exact success of a policy within ``steps`` actions, one number for each goal.
 
-    The start is uniform over the states (of ``starts``) other than the goal from which the goal can be reached;
-    unreachable pairs are excluded (see :func:`success_over_starts`).
+    The start is uniform over the states (of ``starts``) other than the goal from which the goal can be
+    reached in the graph; unreachable pairs are excluded (see :func:`success_over_starts`).
 
     Args:
         graph: (N, A) integers, -1 = blocked.
         action_probabilities: (N, A) or (G, N, A), see :func:`arrival_probability`.
         goals: one state id, or (G,) of them.
         steps: actions allowed.
-        starts: state ids to start from; None for all states.
+        starts: the set of state ids to start from; None for all states.
 
     Returns:
         (G,) float64 in [0, 1], NaN for a goal that no start can reach.
@@ -326,7 +343,7 @@ def random_walk_success(graph: Tensor | np.ndarray, goals: Any, steps: int, star
         graph: (N, A) integers, -1 = blocked.
         goals: one state id, or (G,) of them.
         steps: actions allowed.
-        starts: state ids to start from; None for all states.
+        starts: the set of state ids to start from; None for all states.
 
     Returns:
         (G,) float64 in [0, 1], NaN for a goal that no start can reach.

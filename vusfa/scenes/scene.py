@@ -1,8 +1,8 @@
 """One scene: a room as a finite graph of photographed poses.
 
 A state is a pose (a place and a heading) with its picture's features; an action leads to another state or is
-blocked. Nothing of an open file is kept: a scene can be pickled, forked and spawned. Pictures are read from the
-file when they are asked for.
+blocked. No file stays open: a scene can be pickled, forked and spawned. Pictures are read from the file when
+they are asked for.
 """
 
 from __future__ import annotations
@@ -20,8 +20,9 @@ from torch import Tensor
 
 from vusfa.errors import SceneError
 from vusfa.scenes import store
-from vusfa.scenes.faults import array_faults
-from vusfa.scenes.graph import shortest_path_distances, weak_components
+from vusfa.scenes.faults import DATASETS, array_faults, raise_faults
+from vusfa.scenes.graph import default_actions, shortest_path_distances, weak_components
+from vusfa.scenes.pictures import read_pictures
 
 __all__ = ["Scene"]
 
@@ -30,7 +31,7 @@ __all__ = ["Scene"]
 class Scene:
     """A room: its graph, its pictures' features, its poses. All tensors are on the CPU.
 
-    Built from tensors or arrays, which are checked and converted; or read by :meth:`load` and :meth:`bundled`.
+    Built from tensors or arrays, which are checked and copied; or read by :meth:`load` and :meth:`bundled`.
 
     Args:
         name: what the scene is called.
@@ -38,8 +39,8 @@ class Scene:
         features: (N, C, F) floats, C crops (augmented views) of F features; kept as float32.
         location: (N, 2) metres; zeros when not given.
         rotation: (N,) degrees; zeros when not given.
-        distance: (N, N) integers, ``[s, g]`` actions from s to g, -1 = unreachable; computed when not given, and
-            checked against a breadth-first search when given.
+        distance: (N, N) integers, ``[s, g]`` actions from s to g, -1 = unreachable; computed when not
+            given, and checked against a breadth-first search when given.
         actions: A names; the THOR v1 dumps' four when not given and A is 4.
         attributes: provenance: str, int, float, or lists of these.
         path: the file that pictures are read from; None for a scene in memory.
@@ -48,13 +49,13 @@ class Scene:
     Raises:
         SceneError: something does not fit; the message lists every fault.
 
-    >>> corridor = Scene("corridor", graph=torch.tensor([[1, -1], [2, 0], [-1, 1]]), features=torch.rand(3, 1, 8))
+    >>> corridor = Scene("corridor", torch.tensor([[1, -1], [2, 0], [-1, 1]]), torch.rand(3, 1, 8))
     >>> corridor.distance.tolist()
     [[0, 1, 2], [1, 0, 1], [2, 1, 0]]
-    >>> Scene("broken", graph=torch.tensor([[1, -1], [5, 0]]), features=torch.rand(2, 1, 8))
+    >>> Scene("broken", torch.tensor([[1, -1], [5, 0]]), torch.rand(2, 1, 8))
     Traceback (most recent call last):
     ...
-    vusfa.errors.SceneError: scene 'broken': dataset 'graph', state 1: action 0 leads to 5, but the states are ...
+    vusfa.errors.SceneError: scene 'broken': dataset 'graph', state 1: action 0 leads to 5, but states are ...
     """
 
     name: str
@@ -69,37 +70,33 @@ class Scene:
     picture_shape: tuple[int, int, int] | None = None
 
     def __post_init__(self) -> None:
-        source = str(self.path) if self.path is not None else f"scene {self.name!r}"
-        arrays = {
-            "graph": _numpy(self.graph),
-            "resnet_feature": _numpy(self.features),
-        }
-        num_states = arrays["graph"].shape[0] if arrays["graph"].ndim else 0
-        location, rotation = (_numpy(self.location), _numpy(self.rotation))
-        arrays["location"] = np.zeros((num_states, 2), np.float32) if self.location is None else location
-        arrays["rotation"] = np.zeros(num_states, np.float32) if self.rotation is None else rotation
-        given = None if self.distance is None else _numpy(self.distance)
-        # Until the graph is known to be sound no search can run on it; the diagonal's zeros stand in for the check.
-        arrays["shortest_path_distance"] = (
-            np.zeros((num_states, num_states), np.int16) if given is None else given
-        )
+        arrays = {"graph": _numpy(self.graph), "resnet_feature": _numpy(self.features)}
+        num_states = len(arrays["graph"]) if arrays["graph"].ndim else 0
+        arrays["location"] = np.zeros((num_states, 2)) if self.location is None else _numpy(self.location)
+        arrays["rotation"] = np.zeros(num_states) if self.rotation is None else _numpy(self.rotation)
+        if self.distance is not None:
+            arrays["shortest_path_distance"] = _numpy(self.distance)
         actions = None if self.actions is None else tuple(self.actions)
-        faults = array_faults(arrays, actions)
-        if given is None:
-            faults = [fault for fault in faults if "shortest_path_distance" not in fault]
-        store.raise_faults(source, faults)
-        distance = shortest_path_distances(arrays["graph"])
-        values = {
-            "graph": torch.tensor(arrays["graph"].astype(np.int64)),
-            "features": torch.tensor(arrays["resnet_feature"].astype(np.float32)),
-            "location": torch.tensor(arrays["location"].astype(np.float32)),
-            "rotation": torch.tensor(arrays["rotation"].astype(np.float32)),
+        source = f"scene {self.name!r}" if self.path is None else self.path
+        raise_faults(source, array_faults(arrays, actions, optional=["shortest_path_distance"]))
+        if self.distance is None:
+            distance = shortest_path_distances(arrays["graph"])
+        else:
+            # Checked against the search above: a path is shorter than the number of states.
+            dtype = np.int16 if num_states <= np.iinfo(np.int16).max else np.int32
+            distance = _tensor(arrays["shortest_path_distance"], dtype)
+        checked = {
+            "graph": _tensor(arrays["graph"], np.int64),
+            "features": _tensor(arrays["resnet_feature"], np.float32),
+            "location": _tensor(arrays["location"], np.float32),
+            "rotation": _tensor(arrays["rotation"], np.float32),
             "distance": distance,
-            "actions": actions or store.default_actions(arrays["graph"].shape[1]),
+            "actions": actions or default_actions(arrays["graph"].shape[1]),
             "attributes": dict(self.attributes),
+            # Workers may run in another folder.
             "path": None if self.path is None else Path(self.path).resolve(),
         }
-        for key, value in values.items():
+        for key, value in checked.items():
             object.__setattr__(self, key, value)
 
     @classmethod
@@ -110,18 +107,19 @@ class Scene:
             SceneError: the file is missing, truncated or has faults; the message lists every one of them.
         """
         dump = store.read(path)
-        store.raise_faults(path, dump.faults)
+        if dump.reading_faults or len(dump.arrays) < len(DATASETS):
+            raise_faults(path, dump.faults())
+        # The values are checked there, once.
+        fields: dict[str, Any] = {
+            "graph": dump.arrays["graph"],
+            "features": dump.arrays["resnet_feature"],
+            "location": dump.arrays["location"],
+            "rotation": dump.arrays["rotation"],
+            "distance": dump.arrays["shortest_path_distance"],
+            "actions": dump.actions,
+        }
         return cls(
-            name=dump.name,
-            graph=dump.arrays["graph"],
-            features=dump.arrays["resnet_feature"],
-            location=dump.arrays["location"],
-            rotation=dump.arrays["rotation"],
-            distance=dump.arrays["shortest_path_distance"],
-            actions=dump.actions,
-            attributes=dump.attributes,
-            path=Path(path),
-            picture_shape=dump.picture_shape,
+            dump.name, **fields, attributes=dump.attributes, path=Path(path), picture_shape=dump.picture_shape
         )
 
     @classmethod
@@ -143,23 +141,14 @@ class Scene:
 
         Args:
             path: where to; replaced if it exists.
-            pictures: (N, H, W, 3) uint8, or N JPEG files as bytes; None copies those that the scene has, as they are.
+            pictures: (N, H, W, 3) uint8, or N JPEG files as bytes; None copies those of the scene's file
+                as they are.
 
         Raises:
             SceneError: the pictures do not fit, an attribute cannot be written, or the folder does not exist.
         """
         if isinstance(pictures, Tensor):
             pictures = pictures.cpu().numpy()
-        if pictures is not None and len(pictures) != self.num_states:
-            raise SceneError(
-                f"scene {self.name!r}: {len(pictures)} pictures for {self.num_states} states; give each one"
-            )
-        if isinstance(pictures, np.ndarray) and (
-            pictures.dtype != np.uint8 or pictures.ndim != 4 or pictures.shape[3] != 3
-        ):
-            raise SceneError(
-                f"scene {self.name!r}: pictures are {pictures.dtype} {pictures.shape}; give uint8 (N, H, W, 3)"
-            )
         store.write(
             path,
             {
@@ -192,7 +181,7 @@ class Scene:
                 f"scene {self.name!r} has no pictures; load it from a file with dataset 'observation'"
             )
         states = torch.as_tensor(ids, dtype=torch.int64).cpu()
-        found = torch.from_numpy(store.read_pictures(self.path, states.reshape(-1).numpy()))
+        found = torch.from_numpy(read_pictures(self.path, states.reshape(-1).numpy()))
         return found.reshape(*states.shape, *found.shape[1:])
 
     @property
@@ -222,7 +211,7 @@ class Scene:
 
     @cached_property
     def islands(self) -> tuple[tuple[int, ...], ...]:
-        """States cut off from the largest connected part, one sorted tuple an island; empty when there is none.
+        """States cut off from the largest connected part, a sorted tuple for each island; often empty.
 
         >>> Scene("two parts", torch.tensor([[1], [0], [0], [3]]), torch.rand(4, 1, 2)).islands
         ((3,),)
@@ -232,3 +221,8 @@ class Scene:
 
 def _numpy(values: Any) -> np.ndarray:
     return values.detach().cpu().numpy() if isinstance(values, Tensor) else np.asarray(values)
+
+
+def _tensor(values: np.ndarray, dtype: Any) -> Tensor:
+    """A copy, so that nobody else can change it."""
+    return torch.from_numpy(np.array(values, dtype=dtype))

@@ -1,7 +1,7 @@
 """Several scenes as one space of state ids.
 
-A set numbers the states of its scenes through: scene i has the ids ``offsets[i] .. offsets[i + 1] - 1``. Whoever
-works with a set (environments, networks) holds integers and looks the rest up here.
+A set numbers the states of its scenes through: scene i has the ids ``offsets[i] .. offsets[i + 1] - 1``.
+Whoever works with a set (environments, networks) holds integers and looks the rest up here.
 """
 
 from __future__ import annotations
@@ -136,10 +136,10 @@ class SceneSet:
 
     @property
     def distance_tables(self) -> tuple[Tensor, Tensor]:
-        """The scenes' N x N tables of shortest paths, row by row and one after the other, for whoever looks up often.
+        """The scenes' N x N tables of shortest paths, row by row, one after the other, for frequent use.
 
-        Entry ``first[i] + s * N + g`` of the first tensor holds the actions from s to g, both in scene i's own ids; the
-        second tensor is ``first``, (n_scenes + 1,). Shared with the set, not copied.
+        Entry ``first[i] + s * N + g`` of the first tensor is the actions from s to g, in scene i's own ids.
+        The second tensor is ``first``, (n_scenes + 1,). Shared with the set, not copied.
         """
         return self._distance, self._distance_start
 
@@ -158,7 +158,7 @@ class SceneSet:
         scene = self.scene_id[state]
         first, size = self.offsets[scene], self.offsets[scene + 1] - self.offsets[scene]
         same = scene == self.scene_id[goal]
-        # Where the scenes differ the sum below could lie outside the table: look up entry 0 and drop the answer.
+        # Where the scenes differ the sum below could lie outside the table: look entry 0 up and drop it.
         place = self._distance_start[scene] + (state - first) * size + (goal - first)
         found = self._distance[torch.where(same, place, 0)].to(torch.int64)
         return torch.where(same, found, -1)
@@ -196,7 +196,8 @@ class SceneSet:
         wrong = ids[(ids < 0) | (ids >= num_states)]
         if wrong.numel():
             raise SceneError(
-                f"scene {self.names[index]!r} has no state {int(wrong[0])}; its states are 0..{num_states - 1}"
+                f"scene {self.names[index]!r} has no state {int(wrong[0])};"
+                f" its states are 0..{num_states - 1}"
             )
         return ids + self.offsets[index]
 
@@ -219,24 +220,29 @@ class SceneSet:
             (*ids.shape, H, W, 3) uint8 on the CPU.
 
         Raises:
-            SceneError: a scene has no pictures, or the scenes' pictures differ in size.
+            SceneError: no such state, a scene without pictures, or pictures of different sizes.
         """
         ids = torch.as_tensor(ids, dtype=torch.int64).cpu()
+        wrong = ids[(ids < 0) | (ids >= self.num_states)]
+        if wrong.numel():
+            raise SceneError(f"there is no state {int(wrong[0])}; this set has 0..{self.num_states - 1}")
         flat = ids.reshape(-1)
-        scene = self.scene_id.cpu()[flat]
-        involved = scene.unique().tolist()
-        shapes = {self.scenes[index].name: self.scenes[index].picture_shape for index in involved}
-        if len(set(shapes.values())) > 1:
-            raise SceneError(
-                f"pictures of different sizes cannot be given as one tensor: {shapes}; ask scene by scene"
-            )
-        local = self.local_id(flat.to(self.device)).cpu()
-        shape = self.scenes[involved[0] if involved else 0].picture_shape or (0, 0, 3)
-        result = torch.empty(len(flat), *shape, dtype=torch.uint8)
+        scene_id, offsets = self.scene_id.cpu()[flat], self.offsets.cpu()
+        involved = scene_id.unique().tolist() or [0]
+        first = self.scenes[involved[0]]
+        parts = []
         for index in involved:
-            rows = scene == index
-            result[rows] = self.scenes[index].pictures(local[rows])
-        return result.reshape(*ids.shape, *shape)
+            scene = self.scenes[index]
+            if scene.has_pictures and scene.picture_shape != first.picture_shape:
+                raise SceneError(
+                    f"scenes {first.name!r} and {scene.name!r} have pictures of different sizes"
+                    f" ({first.picture_shape}, {scene.picture_shape}); ask scene by scene"
+                )
+            parts.append(scene.pictures(flat[scene_id == index] - offsets[index]))
+        result = torch.cat(parts)
+        # They came scene by scene: back into the order asked for.
+        result = result[torch.argsort(torch.argsort(scene_id, stable=True))]
+        return result.reshape(*ids.shape, *result.shape[1:])
 
     def to(self, device: torch.device | str) -> SceneSet:
         """The same set with its tables on a device; the scenes themselves stay on the CPU."""
@@ -286,12 +292,16 @@ def _open_one(scene: str | os.PathLike[str]) -> Scene:
             return Scene.bundled(scene)
         if not Path(scene).is_file():
             raise SceneError(
-                f"{scene!r} is neither a bundled scene ({', '.join(bundled_names())}) nor a file; check the name"
+                f"{scene!r} is neither a bundled scene ({', '.join(bundled_names())}) nor a file;"
+                f" check the name"
             )
     return Scene.load(scene)
 
 
 def _check_alike(scenes: Sequence[Scene]) -> None:
+    for scene in scenes:
+        if not isinstance(scene, Scene):
+            raise SceneError(f"{scene!r} is no Scene; open names and files with SceneSet.open")
     if not scenes:
         raise SceneError(f"a SceneSet needs at least one scene; bundled are {', '.join(bundled_names())}")
     names = [scene.name for scene in scenes]

@@ -1,0 +1,78 @@
+"""Opening and replacing HDF5 files: no handle outlives its block, and nobody ever sees half a file."""
+
+from __future__ import annotations
+
+import uuid
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+
+from vusfa.errors import SceneError
+
+__all__ = ["dataset_in", "opened", "plain", "replaced"]
+
+
+@contextmanager
+def opened(path: Path) -> Iterator[h5py.File]:
+    """A file open for reading within a ``with`` block.
+
+    Raises:
+        SceneError: the file is missing, truncated or damaged, or is no HDF5 file.
+    """
+    if not path.is_file():
+        raise SceneError(f"{path}: there is no such file; check the path")
+    try:
+        with h5py.File(path, "r") as file:
+            yield file
+    # What HDF5 meets in a damaged file comes as any of these.
+    except (OSError, RuntimeError, KeyError) as error:
+        raise SceneError(
+            f"{path}: cannot be read as HDF5 ({error}); the file is truncated, damaged or something else:"
+            f" copy it or make it again"
+        ) from error
+
+
+@contextmanager
+def replaced(path: Path) -> Iterator[h5py.File]:
+    """A new file, open for writing within a ``with`` block, that takes its name when the block is done.
+
+    Until then it lies in the same folder under a temporary name; if the block fails it is removed, and a
+    file that had the name before is untouched.
+
+    Raises:
+        SceneError: the file cannot be written.
+    """
+    temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex}.part")
+    try:
+        with h5py.File(temporary, "w") as file:
+            yield file
+        temporary.replace(path)
+    except OSError as error:
+        raise SceneError(f"{path}: cannot be written ({error}); check folder, rights and space") from error
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def dataset_in(file: h5py.File, name: str) -> h5py.Dataset | None:
+    """A dataset by name; None when there is none, or a group of that name."""
+    found = file.get(name)
+    return found if isinstance(found, h5py.Dataset) else None
+
+
+def plain(value: Any) -> Any:
+    """An attribute's value as str, int, float, bool, or lists of these.
+
+    >>> plain(np.array([b"a", b"b"])), plain(np.float64(0.5)), plain(np.arange(3))
+    (['a', 'b'], 0.5, [0, 1, 2])
+    """
+    if isinstance(value, bytes):
+        return value.decode("utf-8", "replace")
+    if isinstance(value, np.ndarray | np.generic):
+        return plain(value.tolist())
+    if isinstance(value, list):
+        return [plain(item) for item in value]
+    return value

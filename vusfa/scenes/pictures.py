@@ -1,0 +1,172 @@
+"""A scene's pictures, in either of two datasets.
+
+``observation`` (N, H, W, 3) uint8 is the THOR v1 schema's; ``observation_jpeg`` (N,), each entry the bytes
+of a JPEG file, is ours and about ten times smaller. Where a file has both, ``observation``
+counts: it is exact.
+"""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Iterable, Iterator, Sequence
+from pathlib import Path
+
+import h5py
+import numpy as np
+from PIL import Image
+
+from vusfa.errors import SceneError
+from vusfa.scenes.hdf5 import dataset_in, opened
+
+__all__ = ["look", "picture_faults", "read_jpegs", "read_pictures", "to_jpeg", "write_jpegs", "write_raw"]
+
+_RAW, _JPEG = "observation", "observation_jpeg"
+_AT_ONCE = 32
+_QUALITY = 92
+
+
+def _find(file: h5py.File) -> tuple[str, h5py.Dataset] | None:
+    for name in (_RAW, _JPEG):
+        dataset = dataset_in(file, name)
+        if dataset is not None:
+            return name, dataset
+    return None
+
+
+def _decode(jpeg: np.ndarray) -> np.ndarray:
+    with Image.open(io.BytesIO(jpeg.tobytes())) as image:
+        return np.asarray(image.convert("RGB"))
+
+
+def to_jpeg(picture: np.ndarray) -> bytes:
+    """A picture (H, W, 3) uint8 as a JPEG file of quality 92."""
+    buffer = io.BytesIO()
+    Image.fromarray(picture).save(buffer, "JPEG", quality=_QUALITY)
+    return buffer.getvalue()
+
+
+def look(file: h5py.File, num_states: int | None) -> tuple[tuple[int, int, int] | None, list[str]]:
+    """Size of a file's pictures (None without any) and their faults, by the header and the first picture."""
+    found = _find(file)
+    if found is None:
+        return None, []
+    name, dataset = found
+    wanted = "uint8 (N, H, W, 3)" if name == _RAW else "(N,) of variable-length uint8"
+    held = f"dataset {name!r} holds {dataset.dtype} of shape {dataset.shape}"
+    if name == _RAW:
+        fits = dataset.dtype == np.uint8 and len(dataset.shape or ()) == 4 and dataset.shape[3] == 3
+    else:
+        fits = h5py.check_vlen_dtype(dataset.dtype) == np.uint8 and len(dataset.shape or ()) == 1
+    if not fits or 0 in dataset.shape:
+        return None, [f"{held}; write it as {wanted}, or leave it out"]
+    if num_states is not None and len(dataset) != num_states:
+        return None, [
+            f"dataset {name!r} has {len(dataset)} pictures, but the graph has {num_states} states;"
+            f" write one per state, or leave it out"
+        ]
+    if name == _RAW:
+        return (dataset.shape[1], dataset.shape[2], 3), []
+    try:
+        height, width, _ = _decode(dataset[0]).shape
+    except OSError as error:
+        return None, [f"dataset {name!r}, state 0: is no picture ({error}); write it again"]
+    return (height, width, 3), []
+
+
+def read_pictures(path: Path, ids: np.ndarray) -> np.ndarray:
+    """The pictures of some states; only these are read.
+
+    Args:
+        path: the scene's file.
+        ids: (n,) integers in any order, repeats allowed.
+
+    Returns:
+        (n, H, W, 3) uint8.
+
+    Raises:
+        SceneError: the file has no pictures, a state is out of range, or a picture is damaged.
+    """
+    # HDF5 reads a list of rows only in increasing order and without repeats.
+    states, back = np.unique(np.asarray(ids, dtype=np.int64), return_inverse=True)
+    with opened(path) as file:
+        found = _find(file)
+        if found is None:
+            raise SceneError(f"{path}: has no pictures; write dataset {_RAW!r}, uint8 (N, H, W, 3)")
+        name, dataset = found
+        if len(states) and (states[0] < 0 or states[-1] >= len(dataset)):
+            wrong = states[0] if states[0] < 0 else states[-1]
+            raise SceneError(f"{path}: there is no state {wrong}; the states are 0..{len(dataset) - 1}")
+        if name == _RAW:
+            return dataset[states][back]
+        # At least one is decoded, for its size, when none is asked for.
+        jpegs = dataset[states] if len(states) else dataset[:1]
+    return _decode_all(path, states, jpegs)[back]
+
+
+def _decode_all(path: Path, states: np.ndarray, jpegs: Sequence[np.ndarray]) -> np.ndarray:
+    pictures: list[np.ndarray] = []
+    for index, jpeg in enumerate(jpegs):
+        state = states[index] if len(states) else 0
+        try:
+            pictures.append(_decode(jpeg))
+        except OSError as error:
+            raise SceneError(
+                f"{path}: dataset {_JPEG!r}, state {state}: is no picture ({error}); write it again"
+            ) from error
+        if pictures[-1].shape != pictures[0].shape:
+            raise SceneError(
+                f"{path}: dataset {_JPEG!r}, state {state}: is {pictures[-1].shape[:2]} in size, state"
+                f" {states[0]} is {pictures[0].shape[:2]}; write all in one size"
+            )
+    return np.stack(pictures)
+
+
+def raw_blocks(path: Path, num_states: int) -> Iterator[np.ndarray]:
+    """All pictures of a file in order, some (n, H, W, 3) at a time."""
+    for first in range(0, num_states, _AT_ONCE):
+        yield read_pictures(path, np.arange(first, min(first + _AT_ONCE, num_states)))
+
+
+def picture_faults(path: Path, num_states: int) -> list[str]:
+    """Read every picture; the first fault among them, or an empty list."""
+    first_shape = None
+    try:
+        for number, block in enumerate(raw_blocks(path, num_states)):
+            first_shape = first_shape or block.shape[1:]
+            if block.shape[1:] != first_shape:
+                return [
+                    f"{path}: dataset {_JPEG!r}, state {number * _AT_ONCE}: is {block.shape[1:3]} in size,"
+                    f" state 0 is {first_shape[:2]}; write all in one size"
+                ]
+    except SceneError as error:
+        return [str(error)]
+    return []
+
+
+def read_jpegs(path: Path) -> list[bytes] | None:
+    """The JPEG files of all states as they lie there; None when the pictures are raw."""
+    with opened(path) as file:
+        found = _find(file)
+        if found is None or found[0] != _JPEG:
+            return None
+        return [jpeg.tobytes() for jpeg in found[1][()]]
+
+
+def write_jpegs(file: h5py.File, jpegs: Sequence[bytes]) -> None:
+    """Write ``observation_jpeg``."""
+    dataset = file.create_dataset(_JPEG, (len(jpegs),), dtype=h5py.vlen_dtype(np.uint8))
+    for state, jpeg in enumerate(jpegs):
+        dataset[state] = np.frombuffer(jpeg, dtype=np.uint8)
+
+
+def write_raw(file: h5py.File, blocks: Iterable[np.ndarray], num_states: int) -> None:
+    """Write ``observation`` from blocks of (n, H, W, 3) uint8 that make N pictures together."""
+    first = 0
+    for block in blocks:
+        if first == 0:
+            shape = block.shape[1:]
+            dataset = file.create_dataset(
+                _RAW, (num_states, *shape), np.uint8, chunks=(1, *shape), compression="gzip", fletcher32=True
+            )
+        dataset[first : first + len(block)] = block
+        first += len(block)
