@@ -1,5 +1,43 @@
-"""The networks of the four models, as TensorDictModules."""
+"""The networks of the four models, as TensorDictModules.
+
+>>> from vusfa.modules import make_agent
+>>> from vusfa.scenes import SceneSet
+>>> agent = make_agent(model="vusfa", preset="controlled", scenes=SceneSet.bundled())
+>>> agent.get_value_operator().out_keys[-1]
+'state_value'
+"""
 
 from vusfa.modules.agents import Agent, make_agent
+from vusfa.modules.bottleneck import GaussianEncoder, LatentSampler
+from vusfa.modules.frames import FeatureFrames, PictureFrames
+from vusfa.modules.linear import HistoryLinear, SceneLinear
+from vusfa.modules.policy import PolicyHead, SuccessorPolicyHead
+from vusfa.modules.presets import MODELS, PRESETS, AgentConfig, resolve_config
+from vusfa.modules.siamese import SiameseEncoder, frozen
+from vusfa.modules.successor import RewardHead, SuccessorHead, SuccessorValue, ValueHead
+from vusfa.modules.trunk import Fusion, SceneLayer
 
-__all__ = ["Agent", "make_agent"]
+__all__ = [
+    "MODELS",
+    "PRESETS",
+    "Agent",
+    "AgentConfig",
+    "FeatureFrames",
+    "Fusion",
+    "GaussianEncoder",
+    "HistoryLinear",
+    "LatentSampler",
+    "PictureFrames",
+    "PolicyHead",
+    "RewardHead",
+    "SceneLayer",
+    "SceneLinear",
+    "SiameseEncoder",
+    "SuccessorHead",
+    "SuccessorPolicyHead",
+    "SuccessorValue",
+    "ValueHead",
+    "frozen",
+    "make_agent",
+    "resolve_config",
+]

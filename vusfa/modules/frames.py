@@ -34,6 +34,7 @@ class FeatureFrames(nn.Module):
     (torch.Size([1, 2, 8]), 2)
     """
 
+    frame_dims = 1
     table: Tensor
     mean: Tensor
     deviation: Tensor
@@ -82,6 +83,7 @@ class PictureFrames(nn.Module):
     torch.Size([2, 1536])
     """
 
+    frame_dims = 3
     table: Tensor
 
     def __init__(self, pictures: Tensor | None, picture_size: tuple[int, int] = (60, 80)) -> None:

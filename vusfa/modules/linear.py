@@ -61,7 +61,7 @@ class SceneLinear(nn.Module):
     def forward(self, x: Tensor, scene_id: Tensor) -> Tensor:
         """Maps (\\*B, in) with scene indices (\\*B,) int64 to (\\*B, out)."""
         if self.num_scenes == 1:
-            return functional.linear(x, self.weight[0], self.bias[0])
+            return functional.linear(x, self.weight.squeeze(0), self.bias.squeeze(0))
         rows, scene = x.reshape(-1, self.in_features), scene_id.reshape(-1)
         if self.num_scenes * self.out_features <= _DENSE_OUTPUTS or (
             rows.is_cuda and self.num_scenes <= _DENSE_SCENES
@@ -74,22 +74,24 @@ class SceneLinear(nn.Module):
     def _all_scenes(self, rows: Tensor, scene: Tensor) -> Tensor:
         every = functional.linear(rows, self.weight.flatten(0, 1), self.bias.flatten())
         every = every.view(-1, self.num_scenes, self.out_features)
-        return every[torch.arange(len(rows), device=rows.device), scene]
+        return every.gather(1, scene.view(-1, 1, 1).expand(-1, 1, self.out_features)).squeeze(1)
 
     def _by_scene(self, rows: Tensor, scene: Tensor) -> Tensor:
         counts = torch.bincount(scene, minlength=self.num_scenes).tolist()
+        # Unbound, not indexed: the gradients of the slices are then stacked once, not added up in full size.
+        weights, biases = self.weight.unbind(0), self.bias.unbind(0)
         if max(counts) == len(rows):
             only = counts.index(len(rows))
-            return functional.linear(rows, self.weight[only], self.bias[only])
+            return functional.linear(rows, weights[only], biases[only])
         order = scene.argsort(stable=True)
         parts = [
-            functional.linear(part, self.weight[index], self.bias[index])
-            for index, part in enumerate(rows[order].split(counts))
+            functional.linear(part, weights[index], biases[index])
+            for index, part in enumerate(functional.embedding(order, rows).split(counts))
             if counts[index]
         ]
         back = torch.empty_like(order)
         back[order] = torch.arange(len(order), device=order.device)
-        return torch.cat(parts)[back]
+        return functional.embedding(back, torch.cat(parts))
 
     def extra_repr(self) -> str:
         """What ``print`` shows of the layer."""
@@ -134,11 +136,10 @@ class HistoryLinear(nn.Module):
 
     def forward(self, frames: Tensor) -> Tensor:
         """Maps histories (\\*B, H, F), oldest frame first, to (\\*B, out)."""
-        batch = frames.shape[:-2]
-        if self.history == 1:
-            return functional.linear(frames.squeeze(-2), self.weight[0], self.bias)
-        slots = frames.reshape(-1, self.history, self.in_features).transpose(0, 1)
-        return (torch.bmm(slots, self.weight.transpose(1, 2)).sum(0) + self.bias).view(*batch, -1)
+        # A batched product would need the gradient of the weights transposed, which takes longer than itself.
+        biases = (self.bias, *[None] * (self.history - 1))
+        slots = zip(frames.unbind(-2), self.weight.unbind(0), biases, strict=True)
+        return torch.stack([functional.linear(frame, weight, bias) for frame, weight, bias in slots]).sum(0)
 
     def repeated(self, frame: Tensor) -> Tensor:
         """Maps one frame (\\*B, F) that fills all H places to (\\*B, out)."""
@@ -158,8 +159,11 @@ class HistoryLinear(nn.Module):
         Returns:
             (\\*B, out), what :meth:`forward` gives on the frames themselves.
         """
-        place = torch.arange(self.history, device=index.device)
-        return projected[index, place].sum(-2) + self.bias
+        places = (index * self.history + torch.arange(self.history, device=index.device)).flatten(0, -2)
+        # One kernel looks up and sums, forwards and backwards; five to ten times faster than indexing,
+        # then sum.
+        sums = functional.embedding_bag(places, projected.flatten(0, 1), mode="sum")
+        return (sums + self.bias).view(*index.shape[:-1], -1)
 
     def extra_repr(self) -> str:
         """What ``print`` shows of the layer."""

@@ -13,14 +13,18 @@ batch once:
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from vusfa.errors import ConfigError
 from vusfa.modules.frames import FeatureFrames, PictureFrames
 from vusfa.modules.linear import HistoryLinear
 
-__all__ = ["Branch", "SiameseEncoder"]
+__all__ = ["Branch", "SiameseEncoder", "frozen"]
 
 
 class Branch(nn.Module):
@@ -81,6 +85,7 @@ class SiameseEncoder(nn.Module):
         super().__init__()
         self.history = history
         self.by_id = by_id
+        self._frozen: tuple[Tensor, Tensor] | None = None
         self.frames = frames
         self.branch = Branch(history, frames.size, hidden_size, out_features)
         self.goal_branch = None if shared else Branch(history, frames.size, hidden_size, out_features)
@@ -97,23 +102,23 @@ class SiameseEncoder(nn.Module):
         """Codes of observations: every frame of every row is encoded.
 
         Args:
-            observation: features (\\*B, H, F) or pictures (\\*B, H, 3, h, w) uint8, oldest first. Of a
-                longer history the last H frames are read.
+            observation: features (\\*B, H, F) or pictures (\\*B, H, 3, h, w) uint8, oldest first. Of a longer
+                history the last H frames are read.
             goal_observation: (\\*B, F) or (\\*B, 3, h, w).
 
         Returns:
             codes of state and goal, (\\*B, out) each.
+
+        Raises:
+            ConfigError: fewer than H frames.
         """
-        frame_dims = (
-            goal_observation.dim() - 1
-            if goal_observation.dtype != torch.uint8
-            else goal_observation.dim() - 3
-        )
-        history = observation.movedim(frame_dims, 0)[-self.history :].movedim(0, frame_dims)
-        state_first = self.branch.first(self.frames.encode(history))
+        place = -1 - self.frames.frame_dims
+        frames = observation.size(place)
+        self._check_history(frames, "observation")
+        history = observation.narrow(place, frames - self.history, self.history)
+        state = self.branch.finish(self.branch.first(self.frames.encode(history)), self.state_layer)
         goal_branch = self.goal_branch or self.branch
-        goal_first = goal_branch.first.repeated(self.frames.encode(goal_observation))
-        return self.branch.finish(state_first, self.state_layer), goal_branch.finish(goal_first)
+        return state, goal_branch.finish(goal_branch.first.repeated(self.frames.encode(goal_observation)))
 
     def from_ids(self, state_id: Tensor, goal_id: Tensor) -> tuple[Tensor, Tensor]:
         """Codes of states by id: each distinct state of the batch is encoded once.
@@ -124,32 +129,40 @@ class SiameseEncoder(nn.Module):
 
         Returns:
             codes of state and goal, (\\*B, out) each.
+
+        Raises:
+            ConfigError: fewer than H frames.
         """
-        batch = goal_id.shape
+        self._check_history(state_id.shape[-1], "state_id")
         states, goals = state_id[..., -self.history :].reshape(-1, self.history), goal_id.reshape(-1)
-        features, state_row, goal_row = self._distinct_features(states, goals)
-        # From here on a goal is a row of its own in `distinct_goal`, wherever it turns up in the batch.
-        distinct_goal, goal_index = torch.unique(goal_row, return_inverse=True)
-        if self.history == 1:
-            first = self.branch.first(features.unsqueeze(-2))
-            state_code = self.branch.finish(first, self.state_layer)[state_row.squeeze(-1)]
-            goal_first = first[distinct_goal] if self.goal_branch is None else None
-        elif len(features) <= len(states):
-            projected = self.branch.first.project(features)
-            state_code = self.branch.finish(self.branch.first.gather(projected, state_row), self.state_layer)
-            goal_first = self.branch.first.gather(
-                projected, distinct_goal.unsqueeze(-1).expand(-1, self.history)
-            )
+        if self._frozen is not None and not torch.is_grad_enabled():
+            state, goal = self._from_frozen(states, goals)
         else:
-            # Fewer rows than distinct frames: multiplying every frame with every place's weight would be
-            # the longer way.
-            state_code = self.branch.finish(self.branch.first(features[state_row]), self.state_layer)
-            goal_first = None
-        goal_branch = self.goal_branch or self.branch
-        if goal_first is None or self.goal_branch is not None:
-            goal_first = goal_branch.first.repeated(features[distinct_goal])
-        goal_code = goal_branch.finish(goal_first)[goal_index]
-        return state_code.view(*batch, -1), goal_code.view(*batch, -1)
+            state, goal = self._from_distinct(states, goals)
+        return state.view(*goal_id.shape, -1), goal.view(*goal_id.shape, -1)
+
+    def _from_distinct(self, states: Tensor, goals: Tensor) -> tuple[Tensor, Tensor]:
+        features, state_row, goal_row = self._distinct_features(states, goals)
+        goal_row, goal_index = torch.unique(goal_row, return_inverse=True)
+        first = self.branch.first
+        if self.history == 1:
+            each = first(features.unsqueeze(-2))
+            state = functional.embedding(state_row.squeeze(-1), self.branch.finish(each, self.state_layer))
+            goal_first = functional.embedding(goal_row, each)
+        elif len(features) <= len(states):
+            projected = first.project(features)
+            state = self.branch.finish(first.gather(projected, state_row), self.state_layer)
+            goal_first = first.gather(projected, goal_row.unsqueeze(-1).expand(-1, self.history))
+        else:
+            # Fewer rows than distinct frames: every frame with every place's weight would be the longer way.
+            histories = functional.embedding(state_row, features)
+            state = self.branch.finish(first(histories), self.state_layer)
+            goal_first = first.repeated(functional.embedding(goal_row, features))
+        goal_branch = self.branch
+        if self.goal_branch is not None:
+            goal_branch = self.goal_branch
+            goal_first = goal_branch.first.repeated(functional.embedding(goal_row, features))
+        return state, functional.embedding(goal_index, goal_branch.finish(goal_first))
 
     def _distinct_features(self, states: Tensor, goals: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Features (D, F) of the batch's distinct states, and each id's row in them: (R, H) and (R,).
@@ -160,3 +173,64 @@ class SiameseEncoder(nn.Module):
             return self.frames.lookup(None), states, goals
         distinct, row = torch.unique(torch.cat([states.flatten(), goals]), return_inverse=True)
         return self.frames.lookup(distinct), row[: states.numel()].view_as(states), row[states.numel() :]
+
+    def _from_frozen(self, states: Tensor, goals: Tensor) -> tuple[Tensor, Tensor]:
+        assert self._frozen is not None
+        state_part, goal_codes = self._frozen
+        if self.history == 1:
+            return functional.embedding(states.squeeze(-1), state_part), functional.embedding(
+                goals, goal_codes
+            )
+        state = self.branch.finish(self.branch.first.gather(state_part, states), self.state_layer)
+        return state, functional.embedding(goals, goal_codes)
+
+    @torch.no_grad()
+    def freeze(self) -> None:
+        """Encodes all states of the world now; calls without gradients look them up until :meth:`thaw`.
+
+        For evaluation, where the weights stand still. Changing them meanwhile changes nothing that is
+        looked up.
+        """
+        if not self.by_id:
+            return
+        features, first = self.frames.lookup(None), self.branch.first
+        if self.history == 1:
+            state_part = self.branch.finish(first(features.unsqueeze(-2)), self.state_layer)
+        else:
+            state_part = first.project(features)
+        goal_branch = self.goal_branch or self.branch
+        self._frozen = (state_part, goal_branch.finish(goal_branch.first.repeated(features)))
+
+    def thaw(self) -> None:
+        """Encodes with the weights as they are again."""
+        self._frozen = None
+
+    def _check_history(self, frames: int, key: str) -> None:
+        if frames < self.history:
+            raise ConfigError(
+                f"{key} has {frames} frames a row and the agent reads {self.history};"
+                f" give the environment history={self.history}, or the agent history={frames}"
+            )
+
+
+@contextmanager
+def frozen(module: nn.Module) -> Iterator[None]:
+    """Within it, every siamese encoder in ``module`` looks up what it encoded on the way in.
+
+    The weights must not change meanwhile. Gradients are not affected: with gradients on, encoding is done
+    anew. Modules without such an encoder are left as they are, so any policy may be passed.
+
+    >>> from vusfa.modules import make_agent
+    >>> from vusfa.scenes import SceneSet
+    >>> agent = make_agent("usfa", scenes=SceneSet.bundled(["bathroom"]))
+    >>> with frozen(agent), torch.no_grad():
+    ...     state, goal = agent.encoder(torch.zeros(3, 4, dtype=torch.int64), torch.arange(3))
+    """
+    encoders = [part for part in module.modules() if isinstance(part, SiameseEncoder)]
+    try:
+        for encoder in encoders:
+            encoder.freeze()
+        yield
+    finally:
+        for encoder in encoders:
+            encoder.thaw()
