@@ -1,11 +1,17 @@
-"""What all tests share: where the golden numbers of the released code are."""
+"""What all tests share: where the golden numbers of the released code are, and small scenes."""
 
 from __future__ import annotations
 
+import itertools
 import os
+import zlib
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+import torch
+
+from vusfa.scenes import Scene
 
 _BESIDE_THE_REPOSITORY = Path(__file__).parents[2] / "shared" / "golden"
 
@@ -35,3 +41,43 @@ def golden(request: pytest.FixtureRequest) -> Path:
     if not _BESIDE_THE_REPOSITORY.is_dir():
         pytest.skip("no golden numbers here; name their folder with --golden DIR or $VUSFA_GOLDEN")
     return _BESIDE_THE_REPOSITORY
+
+
+def grid_scene(name: str = "hall", width: int = 2, height: int = 2, features: int = 8) -> Scene:
+    """An empty room of width x height places with four headings each: 4 N states, no island, shortest paths of a few steps.
+
+    State = 4 * place + heading (0 is up, then clockwise); MoveForward, RotateRight, RotateLeft, MoveBackward.
+    """
+    graph = torch.full((4 * width * height, 4), -1)
+    moves = [(0, 1), (1, 0), (0, -1), (-1, 0)]
+    location, rotation = [], []
+    for place, (y, x) in enumerate(itertools.product(range(height), range(width))):
+        for heading, (right, up) in enumerate(moves):
+            for action, sign in ((0, 1), (3, -1)):
+                to_x, to_y = x + sign * right, y + sign * up
+                if 0 <= to_x < width and 0 <= to_y < height:
+                    graph[4 * place + heading, action] = 4 * (to_y * width + to_x) + heading
+            graph[4 * place + heading, 1] = 4 * place + (heading + 1) % 4
+            graph[4 * place + heading, 2] = 4 * place + (heading - 1) % 4
+            location.append([0.5 * x, 0.5 * y])
+            rotation.append(90.0 * heading)
+    generator = torch.Generator().manual_seed(zlib.crc32(name.encode()))
+    values = torch.rand(len(graph), 1, features, generator=generator)
+    return Scene(name, graph, values, torch.tensor(location), torch.tensor(rotation))
+
+
+@pytest.fixture
+def make_scene() -> Callable[..., Scene]:
+    """:func:`grid_scene`."""
+    return grid_scene
+
+
+@pytest.fixture
+def scene_file(tmp_path: Path) -> Path:
+    """A scene of 16 states with pictures of 40 x 48 pixels, as a file."""
+    scene = grid_scene()
+    generator = torch.Generator().manual_seed(0)
+    pictures = torch.randint(256, (scene.num_states, 40, 48, 3), dtype=torch.uint8, generator=generator)
+    path = tmp_path / "hall.h5"
+    scene.save(path, pictures)
+    return path
