@@ -6,7 +6,11 @@
 torch.Size([5, 7, 4])
 """
 
+from vusfa.envs import gym
 from vusfa.envs.goals import resolve_goals, spread_goals
 from vusfa.envs.navigation import TargetNavEnv
+from vusfa.envs.observation import SceneObservation
 
-__all__ = ["TargetNavEnv", "resolve_goals", "spread_goals"]
+__all__ = ["SceneObservation", "TargetNavEnv", "resolve_goals", "spread_goals"]
+
+gym.register()

@@ -20,7 +20,15 @@ from torchrl.envs import EnvBase
 from vusfa.envs import dynamics
 from vusfa.envs.goals import GoalSpec, resolve_goals
 from vusfa.envs.rendering import draw_panels
-from vusfa.envs.starts import DRAW_LIMIT, GoalTable, StartTable, draw_goals, draw_starts, start_table
+from vusfa.envs.starts import (
+    DRAW_LIMIT,
+    GoalTable,
+    StartTable,
+    draw_goals,
+    draw_starts,
+    paths_from,
+    start_table,
+)
 from vusfa.errors import ConfigError, GoalError
 from vusfa.scenes import SceneSet
 
@@ -36,8 +44,6 @@ class _World(NamedTuple):
     starts: StartTable
     rows: GoalTable | None  # (*B,), the goal of each row; None when goals are drawn
     distance: Tensor  # flat, scene after scene
-    distance_stride: Tensor  # (n_scenes,), entry of (s, g) = origin + s * stride + g, global ids
-    distance_origin: Tensor  # (n_scenes,)
 
 
 def _map(function: Callable[[Tensor], Tensor], tables: Any) -> Any:
@@ -104,7 +110,7 @@ class TargetNavEnv(EnvBase):
     ([[True], [False]], [[1.0], [-0.009...]])
     """
 
-    batch_locked: ClassVar[bool] = True  # type: ignore[assignment]
+    batch_locked: ClassVar[bool] = True
     metadata: ClassVar[dict[str, Any]] = {"render_modes": ["rgb_array"], "render_fps": 4}
     # reset(tensordict, set_state=True) takes up the episodes that the tensordict describes
     _supports_set_state = True
@@ -153,18 +159,13 @@ class TargetNavEnv(EnvBase):
         if self.goal_sampling == "fixed":
             slot = (torch.arange(self.numel()) + first_goal) % len(self.goals)
             rows = starts.goals.take(slot.reshape(self.batch_size))
-        distance, distance_first = scenes.distance_tables
-        stride = scenes.offsets.diff()
         return _World(
             successor=scenes.successor,
             blocked=scenes.blocked,
             rewards=rewards,
             starts=starts,
             rows=rows,
-            distance=distance,
-            distance_stride=stride,
-            # (s - offset) * stride + (g - offset) without the subtractions
-            distance_origin=distance_first[:-1] - scenes.offsets[:-1] * (stride + 1),
+            distance=scenes.distance_tables[0],
         )
 
     def _make_specs(self) -> None:
@@ -201,14 +202,13 @@ class TargetNavEnv(EnvBase):
             tensordict.get("action"),
         )
         entries = after._asdict()
-        entries["goal_id"] = goal_id
-        entries["scene_id"] = tensordict.get("scene_id")
-        entries["shortest_path"] = tensordict.get("shortest_path")
+        for key in ("goal_id", "scene_id", "shortest_path"):
+            entries[key] = tensordict.get(key)
         stepping = tensordict.get("_step", None)
         if stepping is not None:
             entries = _leave_standing(entries, tensordict, stepping.reshape(self.batch_size))
-        self._show(entries["state_id"], goal_id)
-        return TensorDict(entries, batch_size=self.batch_size, device=self.device)
+        self._show(after.state_id, goal_id)
+        return self._wrap(entries)
 
     def _reset(
         self, tensordict: TensorDictBase | None = None, set_state: bool = False, **_: Any
@@ -216,39 +216,40 @@ class TargetNavEnv(EnvBase):
         if set_state and tensordict is not None and "state_id" in tensordict:
             entries = self._resume(tensordict)
         else:
-            entries = self._begin()
+            start, goals = self._begin()
+            entries = {
+                "state_id": dynamics.start_history(start, self.history),
+                # copies: nobody may write to the tables through the data
+                "goal_id": goals.goal.clone(),
+                "scene_id": goals.scene.clone(),
+                "shortest_path": paths_from(self._world.distance, goals, start).unsqueeze(-1),
+                "step_count": self._zeros(torch.int64),
+            }
         for key in ("collided", "done", "terminated", "truncated"):
-            entries[key] = torch.zeros((*self.batch_size, 1), dtype=torch.bool, device=self.device)
+            entries[key] = self._zeros(torch.bool)
         mask = None if tensordict is None else tensordict.get("_reset", None)
         self._show(entries["state_id"], entries["goal_id"], mask)
-        return TensorDict(entries, batch_size=self.batch_size, device=self.device)
+        return self._wrap(entries)
 
-    def _begin(self) -> dict[str, Tensor]:
-        """Draw an episode for every row. All tensors are new: nobody can write to the tables through them."""
+    def _begin(self) -> tuple[Tensor, GoalTable]:
+        """Draw an episode for every row: where it starts, and its goal."""
         world = self._world
         if world.rows is not None:
-            draw = self._draw(1)[0]
-            rows = world.rows
-        else:
-            draw, scene_draw, goal_draw = self._draw(3)
-            rows = draw_goals(world.starts, scene_draw, goal_draw)
-        start = draw_starts(world.starts.members, rows, draw)
-        return {
-            "state_id": dynamics.start_history(start, self.history),
-            "goal_id": rows.goal.clone(),
-            "scene_id": rows.scene.clone(),
-            "shortest_path": self._shortest_path(start, rows.goal, rows.scene),
-            "step_count": torch.zeros((*self.batch_size, 1), dtype=torch.int64, device=self.device),
-        }
+            return draw_starts(world.starts.members, world.rows, self._draw()), world.rows
+        draw, scene_draw, goal_draw = self._draw(3)
+        goals = draw_goals(world.starts, scene_draw, goal_draw)
+        return draw_starts(world.starts.members, goals, draw), goals
 
-    def _draw(self, count: int) -> Tensor:
-        shape = (count, *self.batch_size)
+    def _draw(self, *count: int) -> Tensor:
+        shape = (*count, *self.batch_size)
         return torch.randint(DRAW_LIMIT, shape, generator=self._generator, device=self.device)
 
-    def _shortest_path(self, state: Tensor, goal: Tensor, scene: Tensor) -> Tensor:
-        world = self._world
-        entry = world.distance_origin[scene] + state * world.distance_stride[scene] + goal
-        return world.distance[entry].to(torch.int64).unsqueeze(-1)
+    def _zeros(self, dtype: torch.dtype) -> Tensor:
+        return torch.zeros((*self.batch_size, 1), dtype=dtype, device=self.device)
+
+    def _wrap(self, entries: dict[str, Tensor]) -> TensorDict:
+        # What TensorDict(entries) would check of each entry at each step holds by construction.
+        return TensorDict._new_unsafe(source=entries, batch_size=self.batch_size, device=self.device)
 
     def _step_and_maybe_reset(self, tensordict: TensorDictBase) -> tuple[TensorDictBase, TensorDictBase]:
         """One step, and new episodes where one ended.
@@ -265,21 +266,29 @@ class TargetNavEnv(EnvBase):
         root = self._step_mdp(tensordict)
         done = following.get("done")
         if done.any():
-            entries = self._begin()
+            start, goals = self._begin()
+            path = paths_from(self._world.distance, goals, start)
             mask = done.squeeze(-1)
-            for key, value in entries.items():
-                where = done if value.ndim > mask.ndim else mask
-                entries[key] = torch.where(where, value, root.get(key))
-            entries["collided"] = root.get("collided") & ~done
+            state_id = torch.where(done, start.unsqueeze(-1), following.get("state_id"))
+            goal_id = torch.where(mask, goals.goal, following.get("goal_id"))
+            entries = {
+                "state_id": state_id,
+                "goal_id": goal_id,
+                "scene_id": torch.where(mask, goals.scene, following.get("scene_id")),
+                "shortest_path": torch.where(done, path.unsqueeze(-1), following.get("shortest_path")),
+                "step_count": following.get("step_count").masked_fill(done, 0),
+                "collided": following.get("collided").masked_fill(done, False),
+            }
             for key in ("done", "terminated", "truncated"):
                 entries[key] = torch.zeros_like(done)
-            root.update(entries)
-            self._show(entries["state_id"], entries["goal_id"])
+            for key, value in entries.items():
+                root._set_str(key, value, validated=True, inplace=False, non_blocking=False)
+            self._show(state_id, goal_id)
         return tensordict, root
 
     # -- putting agents where one wants them -----------------------------------------------------------------
 
-    def set_state(self, state: Tensor | int, goal: Tensor | int) -> TensorDictBase:  # type: ignore[override]
+    def set_state(self, state: Tensor | int, goal: Tensor | int) -> TensorDictBase:
         """Begin an episode in every row at a state of one's choice, towards a goal of one's choice.
 
         Any goal will do, whether or not it is among :attr:`goals`; rows that are later reset draw theirs as
@@ -324,7 +333,7 @@ class TargetNavEnv(EnvBase):
             "goal_id": goal_id.clone(),
             "scene_id": scenes.scene_id.to(self.device)[goal_id],
             "shortest_path": distance.to(self.device).unsqueeze(-1),
-            "step_count": torch.zeros((*self.batch_size, 1), dtype=torch.int64, device=self.device),
+            "step_count": self._zeros(torch.int64),
         }
         for key in ("shortest_path", "step_count"):
             if key in tensordict:
@@ -340,6 +349,11 @@ class TargetNavEnv(EnvBase):
             self._generator.seed()
         else:
             self._generator.manual_seed(seed)
+
+    @property
+    def generator(self) -> torch.Generator:
+        """What every draw comes from."""
+        return self._generator
 
     def get_rng_state(self) -> Tensor:
         """State of the generator, a byte tensor on the CPU."""

@@ -20,7 +20,7 @@ from torch import Tensor
 from vusfa.errors import GoalError
 from vusfa.scenes.graph import steps_to_goals, strong_components
 
-__all__ = ["DRAW_LIMIT", "GoalTable", "StartTable", "draw_goals", "draw_starts", "start_table"]
+__all__ = ["DRAW_LIMIT", "GoalTable", "StartTable", "draw_goals", "draw_starts", "paths_from", "start_table"]
 
 DRAW_LIMIT = 2**62
 
@@ -35,6 +35,8 @@ class GoalTable(NamedTuple):
         first: where the list of its starts begins in :attr:`StartTable.members`.
         starts: number of states an episode can begin at.
         rank: the goal's own position in its list, to be skipped.
+        stride, origin: the actions from state s to the goal stand at ``s * stride + origin`` in the scenes'
+            flat table of shortest paths (``SceneSet.distance_tables``).
     """
 
     goal: Tensor
@@ -42,6 +44,8 @@ class GoalTable(NamedTuple):
     first: Tensor
     starts: Tensor
     rank: Tensor
+    stride: Tensor
+    origin: Tensor
 
     def take(self, slot: Tensor) -> GoalTable:
         """The entries of some goals, by their position in the table."""
@@ -107,9 +111,13 @@ def start_table(graphs: Sequence[Tensor], offsets: Tensor, goals: Tensor, names:
             lists.append(reaching + offset)
             length += len(reaching)
     order = torch.argsort(scene, stable=True)
+    size = offsets.diff()
+    # (s - offset) * size + (goal - offset), from where the scene's table begins, sorted by what multiplies s
+    table = (size * size).cumsum(0) - size * size
+    origin = (table - offsets[:-1] * (size + 1))[scene] + goals
     _, scene_goals = scene.unique(return_counts=True)
     return StartTable(
-        goals=GoalTable(goal=goals, scene=scene, first=first, starts=starts, rank=rank),
+        goals=GoalTable(goals, scene, first, starts, rank, stride=size[scene], origin=origin),
         members=torch.cat(lists),
         order=order,
         scene_first=scene_goals.cumsum(0) - scene_goals,
@@ -139,6 +147,20 @@ def draw_starts(members: Tensor, goals: GoalTable, draw: Tensor) -> Tensor:
     index = draw % goals.starts
     index = index + (index >= goals.rank)
     return members[goals.first + index]
+
+
+def paths_from(distance: Tensor, goals: GoalTable, state: Tensor) -> Tensor:
+    """Actions from states to goals of the same scene, -1 where there is no way.
+
+    Args:
+        distance: the scenes' flat table, ``SceneSet.distance_tables[0]``.
+        goals: the goal of each row, columns (*B,).
+        state: (*B,) int64 global ids.
+
+    Returns:
+        (*B,) int64.
+    """
+    return distance[torch.addcmul(goals.origin, state, goals.stride)].to(torch.int64)
 
 
 def draw_goals(table: StartTable, scene_draw: Tensor, goal_draw: Tensor) -> GoalTable:

@@ -1,0 +1,326 @@
+"""The same task for Gymnasium: ``gymnasium.make("vusfa/TargetNav-v0")``, and a true vector version by
+``make_vec``.
+
+Both are thin: they hold a batched :class:`TargetNavEnv` and speak NumPy. Each row draws its starts and goals
+from a NumPy generator of its own, so that row i of a vector environment reset with seed s walks exactly like
+a single one reset with seed s + i.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from os import PathLike
+from typing import Any, ClassVar
+
+import gymnasium
+import numpy as np
+import torch
+from gymnasium import spaces
+from gymnasium.utils import seeding
+from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector.utils import batch_space
+from tensordict import TensorDict
+from torch import Tensor
+
+from vusfa.envs.goals import GoalSpec
+from vusfa.envs.navigation import TargetNavEnv
+from vusfa.envs.observation import observation_table
+from vusfa.envs.starts import DRAW_LIMIT
+from vusfa.errors import ConfigError
+from vusfa.scenes import SceneSet
+
+__all__ = ["ENV_ID", "TargetNavGym", "TargetNavVector", "register"]
+
+ENV_ID = "vusfa/TargetNav-v0"
+
+Scenes = SceneSet | str | PathLike[str] | Sequence[str | PathLike[str]]
+Observation = dict[str, Any]
+
+
+def register() -> None:
+    """Make the task known to Gymnasium; ``import vusfa.envs`` does it.
+
+    >>> register()
+    >>> gymnasium.make("vusfa.envs:vusfa/TargetNav-v0", scenes="bathroom").action_space
+    Discrete(4)
+    """
+    if ENV_ID not in gymnasium.registry:
+        gymnasium.register(
+            ENV_ID,
+            entry_point="vusfa.envs.gym:TargetNavGym",
+            vector_entry_point="vusfa.envs.gym:TargetNavVector",
+        )
+
+
+class _Rows(TargetNavEnv):
+    """A batched environment whose rows draw from generators of their own, as Gymnasium's seeding has it."""
+
+    def __init__(self, scenes: Scenes | None, num_rows: int, **options: Any) -> None:
+        if not isinstance(scenes, SceneSet):
+            scenes = SceneSet.bundled() if scenes is None else SceneSet.open(scenes)
+        self.__dict__["rngs"] = [None] * num_rows
+        self.__dict__["drawing"] = np.zeros(num_rows, dtype=np.bool_)
+        super().__init__(scenes, batch_size=[num_rows], **options)
+
+    def _draw(self, *count: int) -> Tensor:
+        draws = np.zeros((self.numel(), *count), dtype=np.int64)
+        for row in self.drawing.nonzero()[0]:
+            draws[row] = self.rngs[row].integers(DRAW_LIMIT, size=count)
+        return torch.from_numpy(np.moveaxis(draws, 0, -1))
+
+
+class _Task:
+    """What the single and the vector version share: the rows, where they are, and how they are seen."""
+
+    def __init__(
+        self,
+        scenes: Scenes | None,
+        num_rows: int,
+        observation: str,
+        render_mode: str | None,
+        panels: Sequence[str] | None,
+        options: dict[str, Any],
+    ) -> None:
+        if observation not in ("index", "features", "pixels"):
+            raise ConfigError(f"observation is {observation!r}; it is 'index', 'features' or 'pixels'")
+        if render_mode not in (None, "rgb_array"):
+            raise ConfigError(f"render_mode is {render_mode!r}; it is None or 'rgb_array'")
+        self.rows = _Rows(scenes, num_rows, **options)
+        self.panels = panels
+        self.data = TensorDict(batch_size=[num_rows])
+        world = self.rows.scenes
+        self.table = None if observation == "index" else observation_table(world, observation)[:, 0].numpy()
+        self.observation_space = self._space()
+        self.action_space = spaces.Discrete(world.num_actions)
+
+    def _space(self) -> spaces.Dict:
+        world, history = self.rows.scenes, self.rows.history
+        scene = spaces.Discrete(world.num_scenes)
+        if self.table is None:
+            return spaces.Dict(
+                state_id=spaces.MultiDiscrete([world.num_states] * history),
+                goal_id=spaces.Discrete(world.num_states),
+                scene_id=scene,
+            )
+        is_pixels = self.table.dtype == np.uint8
+        low, high = (0, 255) if is_pixels else (self.table.min(), self.table.max())
+        box: dict[str, Any] = {"low": low, "high": high, "dtype": self.table.dtype.type}
+        return spaces.Dict(
+            observation=spaces.Box(shape=(history, *self.table.shape[1:]), **box),
+            goal_observation=spaces.Box(shape=self.table.shape[1:], **box),
+            scene_id=scene,
+        )
+
+    def begin(self, mask: np.ndarray, options: dict[str, Any] | None) -> None:
+        """New episodes in the rows of the mask: at a chosen ``state`` towards a chosen ``goal``, or drawn."""
+        self.rows.drawing = mask
+        chosen = {key: value for key, value in (options or {}).items() if key in ("state", "goal")}
+        if len(chosen) == 1:
+            raise ConfigError(
+                f"reset options hold only {next(iter(chosen))!r}; give 'state' and 'goal', or neither"
+            )
+        fresh = self.rows.set_state(**chosen) if chosen else self.rows.reset()
+        self.data = fresh if mask.all() else torch.where(torch.from_numpy(mask), fresh, self.data)
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Move every row; its reward (float64), termination and truncation, (n,) each."""
+        self.data.set("action", torch.from_numpy(np.asarray(action, dtype=np.int64)))
+        after = self.rows.step(self.data).get("next")
+        reward, terminated, truncated = (
+            after.get(key)[:, 0].numpy() for key in ("reward", "terminated", "truncated")
+        )
+        self.data = after.exclude("reward")
+        return reward.astype(np.float64), terminated, truncated
+
+    def observe(self) -> Observation:
+        """What the rows see, (n, ...) each."""
+        state, goal, scene = (self.data.get(key).numpy() for key in ("state_id", "goal_id", "scene_id"))
+        if self.table is None:
+            return {"state_id": state.copy(), "goal_id": goal.copy(), "scene_id": scene.copy()}
+        return {
+            "observation": self.table[state],
+            "goal_observation": self.table[goal],
+            "scene_id": scene.copy(),
+        }
+
+    def info(self) -> dict[str, np.ndarray]:
+        """What the rows may be told besides, (n,) each."""
+        collided, path = (self.data.get(key)[:, 0].numpy() for key in ("collided", "shortest_path"))
+        return {"collided": collided.copy(), "shortest_path": path.copy()}
+
+    def render(self, row: int) -> np.ndarray:
+        return self.rows.render(self.data, row, self.panels)
+
+
+class TargetNavGym(gymnasium.Env[Observation, np.int64]):
+    """Walk to the place where a picture was taken, one agent.
+
+    Args:
+        scenes: a :class:`SceneSet`, or bundled names and files; all bundled rooms by default.
+        goals: see :mod:`vusfa.envs.goals`.
+        observation: "index": ``state_id`` (H,), ``goal_id``; "features" or "pixels": ``observation`` (H, ...)
+            and ``goal_observation``, as :class:`vusfa.envs.SceneObservation` writes them; always
+            ``scene_id``.
+        render_mode: "rgb_array" or None.
+        panels: what to render, see :meth:`TargetNavEnv.render`.
+        goal_sampling: "episode" draws a goal for each episode, "fixed" keeps one.
+        options: further arguments of :class:`TargetNavEnv` (history, max_steps, goal_reward, ...).
+
+    ``info`` holds ``collided`` and ``shortest_path``. ``reset(options={"state": 3, "goal": 80})`` begins at a
+    state of one's choice (global ids).
+
+    >>> env = gymnasium.make("vusfa/TargetNav-v0", scenes="bathroom", goals=[73])
+    >>> observation, info = env.reset(options={"state": 72, "goal": 73})
+    >>> observation["goal_id"], info["shortest_path"]
+    (np.int64(73), 1)
+    >>> _, reward, terminated, truncated, _ = env.step(1)
+    >>> reward, terminated, truncated
+    (1.0, True, False)
+    """
+
+    metadata: ClassVar[dict[str, Any]] = {  # type: ignore[misc]
+        "render_modes": ["rgb_array"],
+        "render_fps": 4,
+    }
+
+    def __init__(
+        self,
+        scenes: Scenes | None = None,
+        goals: GoalSpec = "paper",
+        observation: str = "index",
+        render_mode: str | None = None,
+        panels: Sequence[str] | None = None,
+        goal_sampling: str = "episode",
+        **options: Any,
+    ) -> None:
+        options = {"goals": goals, "goal_sampling": goal_sampling, **options}
+        self._task = _Task(scenes, 1, observation, render_mode, panels, options)
+        self.render_mode = render_mode
+        self.observation_space = self._task.observation_space
+        self.action_space = self._task.action_space
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Observation, dict[str, Any]]:
+        """Begin an episode; ``options`` may hold ``state`` and ``goal``."""
+        super().reset(seed=seed)
+        self._task.rows.rngs[0] = self.np_random
+        self._task.begin(np.ones(1, dtype=np.bool_), options)
+        return self._observe(), self._info()
+
+    def step(self, action: np.int64) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
+        """Move by one action."""
+        reward, terminated, truncated = self._task.step(np.array([action]))
+        return self._observe(), float(reward[0]), bool(terminated[0]), bool(truncated[0]), self._info()
+
+    def render(self) -> np.ndarray | None:
+        """The picture that ``panels`` describe, (h, w, 3) uint8; None without a render mode."""
+        return None if self.render_mode is None else self._task.render(0)
+
+    def _observe(self) -> Observation:
+        return {key: value[0] for key, value in self._task.observe().items()}
+
+    def _info(self) -> dict[str, Any]:
+        return {key: value[0].item() for key, value in self._task.info().items()}
+
+
+class TargetNavVector(VectorEnv[Observation, np.ndarray, np.ndarray]):
+    """Walk to the place where a picture was taken, many agents in one tensor operation each.
+
+    Autoreset is NEXT_STEP, Gymnasium's default: the step after an episode's end ignores the action, begins
+    the next episode, and earns 0. Arguments as those of :class:`TargetNavGym`; with ``goal_sampling="fixed"``
+    row i keeps goal ``i % G``.
+
+    >>> envs = gymnasium.make_vec("vusfa/TargetNav-v0", 8, "vector_entry_point", scenes="bathroom")
+    >>> envs.reset(seed=0)[0]["state_id"].shape, envs.metadata["autoreset_mode"]
+    ((8, 4), <AutoresetMode.NEXT_STEP: 'NextStep'>)
+    """
+
+    metadata: ClassVar[dict[str, Any]] = {  # type: ignore[misc]
+        "render_modes": ["rgb_array"],
+        "render_fps": 4,
+        "autoreset_mode": AutoresetMode.NEXT_STEP,
+    }
+
+    def __init__(
+        self,
+        num_envs: int = 1,
+        scenes: Scenes | None = None,
+        goals: GoalSpec = "paper",
+        observation: str = "index",
+        render_mode: str | None = None,
+        panels: Sequence[str] | None = None,
+        goal_sampling: str = "episode",
+        **options: Any,
+    ) -> None:
+        options = {"goals": goals, "goal_sampling": goal_sampling, **options}
+        self._task = _Task(scenes, num_envs, observation, render_mode, panels, options)
+        self._ended = np.zeros(num_envs, dtype=np.bool_)
+        self._seeds = [-1] * num_envs
+        self.num_envs = num_envs
+        self.render_mode = render_mode
+        self.single_observation_space = self._task.observation_space
+        self.single_action_space = self._task.action_space
+        self.observation_space = batch_space(self.single_observation_space, num_envs)
+        self.action_space = batch_space(self.single_action_space, num_envs)
+
+    def reset(
+        self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Observation, dict[str, Any]]:
+        """Begin episodes in all rows, or in those of ``options["reset_mask"]`` (n,) bool.
+
+        Row i is seeded with ``seed + i``, or with the i-th of several seeds; ``options`` may hold ``state``
+        and ``goal``, one for all rows or one for each.
+        """
+        options = dict(options or {})
+        mask = np.asarray(options.pop("reset_mask", np.ones(self.num_envs, dtype=np.bool_)))
+        if mask.dtype != np.bool_ or mask.shape != (self.num_envs,) or not mask.any():
+            raise ConfigError(f"reset_mask is {mask!r}; give ({self.num_envs},) bool with at least one True")
+        if isinstance(seed, Sequence):
+            seeds = list(seed)
+        else:
+            seeds = [None if seed is None else seed + row for row in range(self.num_envs)]
+        if len(seeds) != self.num_envs:
+            raise ConfigError(
+                f"{len(seeds)} seeds for {self.num_envs} environments; give one number, or one each"
+            )
+        for row, row_seed in enumerate(seeds):
+            if mask[row] and (row_seed is not None or self._task.rows.rngs[row] is None):
+                self._task.rows.rngs[row], self._seeds[row] = seeding.np_random(row_seed)
+        self._task.begin(mask, options)
+        self._ended = self._ended & ~mask
+        return self._task.observe(), self._info(mask)
+
+    def step(
+        self, actions: np.ndarray
+    ) -> tuple[Observation, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
+        """Move every row by its action (n,), or begin its next episode if it ended with the step before."""
+        again = self._ended
+        reward, terminated, truncated = self._task.step(actions)
+        if again.any():
+            self._task.begin(again, None)
+            reward, terminated, truncated = (np.where(again, 0, x) for x in (reward, terminated, truncated))
+            terminated, truncated = terminated.astype(np.bool_), truncated.astype(np.bool_)
+        self._ended = terminated | truncated
+        return self._task.observe(), reward, terminated, truncated, self._info(np.ones_like(again))
+
+    def render(self) -> tuple[np.ndarray, ...] | None:  # type: ignore[override]
+        """A picture of each row; None without a render mode."""
+        return None if self.render_mode is None else tuple(map(self._task.render, range(self.num_envs)))
+
+    @property
+    def np_random(self) -> tuple[np.random.Generator, ...]:  # type: ignore[override]
+        """The generators of the rows."""
+        return tuple(self._task.rows.rngs)
+
+    @property
+    def np_random_seed(self) -> tuple[int, ...]:  # type: ignore[override]
+        """The seeds of the rows."""
+        return tuple(self._seeds)
+
+    def _info(self, mask: np.ndarray) -> dict[str, Any]:
+        info: dict[str, Any] = {}
+        for key, value in self._task.info().items():
+            info[key] = np.where(mask, value, np.zeros_like(value))
+            info[f"_{key}"] = mask.copy()
+        return info

@@ -1,0 +1,166 @@
+"""What an agent sees, for pipelines that want to be given it: state ids become features or pixels.
+
+Our own agents are given ids and look features up themselves, so that no feature travels through collectors,
+buffers and pipes. :class:`SceneObservation` writes the same numbers into the data, for whoever brings a
+network of their own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from tensordict import NestedKey, TensorDictBase
+from torch import Tensor
+from torch.nn.functional import interpolate
+from torchrl.data import Bounded, Composite, TensorSpec, Unbounded
+from torchrl.envs import ObservationTransform, TransformedEnv
+
+from vusfa.envs.navigation import TargetNavEnv
+from vusfa.errors import ConfigError, SceneError
+from vusfa.scenes import SceneSet
+
+__all__ = ["SceneObservation", "observation_table"]
+
+
+def observation_table(scenes: SceneSet, kind: str, size: tuple[int, int] | None = None) -> Tensor:
+    """What every state of a set looks like.
+
+    Args:
+        scenes: the world.
+        kind: "features" or "pixels".
+        size: height and width that pictures are scaled to; None leaves them as they are.
+
+    Returns:
+        (S, C, F) float32 features, C crops of each; or (S, 1, 3, h, w) uint8 pixels.
+
+    Raises:
+        ConfigError: another kind.
+        SceneError: a scene has no pictures, or they differ in size between scenes and no size is given.
+
+    >>> bathroom = SceneSet.bundled(["bathroom"])
+    >>> observation_table(bathroom, "features").shape, observation_table(bathroom, "pixels", (24, 32)).shape
+    (torch.Size([176, 1, 1280]), torch.Size([176, 1, 3, 24, 32]))
+    """
+    if kind == "features":
+        return scenes.features
+    if kind != "pixels":
+        raise ConfigError(f"kind is {kind!r}; it is 'features' or 'pixels'")
+    shapes = {scene.picture_shape for scene in scenes.scenes}
+    if size is None and None not in shapes and len(shapes) > 1:
+        raise SceneError(f"the scenes' pictures differ in size ({shapes}); pass size=(height, width)")
+    parts = []
+    for scene in scenes.scenes:
+        pixels = scene.pictures(torch.arange(scene.num_states)).permute(0, 3, 1, 2)
+        if size is not None and tuple(pixels.shape[-2:]) != tuple(size):
+            pixels = interpolate(pixels, size=tuple(size), mode="bilinear", antialias=True)
+        parts.append(pixels.contiguous())
+    return torch.cat(parts).unsqueeze(1)
+
+
+class SceneObservation(ObservationTransform):
+    """Writes ``observation`` (from ``state_id``) and ``goal_observation`` (from ``goal_id``).
+
+    ===================  ============================  ==============================
+    key                  kind "features", float32      kind "pixels", uint8
+    ===================  ============================  ==============================
+    observation          (*B, H, F), oldest first      (*B, H, 3, h, w)
+    goal_observation     (*B, F)                       (*B, 3, h, w)
+    ===================  ============================  ==============================
+
+    Args:
+        scenes: the environment's world.
+        kind: "features" or "pixels". Pictures are read into memory when the first is needed, and do not
+            travel to worker processes, which read their own.
+        crop: which of the C augmented views of a state is taken: "first", an index, or "random", which draws
+            one for every frame that is written. The draws come from the environment's own generator where the
+            transform stands in a :class:`TargetNavEnv`, and from torch's global one elsewhere (in a replay
+            buffer, say).
+        size: height and width that pictures are scaled to.
+        in_keys: the keys of ids; any number of them.
+        out_keys: the keys to write, one for each.
+
+    Raises:
+        ConfigError: another kind, or a crop that does not exist.
+        SceneError: pixels are asked for and a scene has no pictures.
+
+    >>> scenes = SceneSet.bundled(["bathroom"])
+    >>> env = TransformedEnv(TargetNavEnv(scenes, batch_size=[2], seed=0), SceneObservation(scenes))
+    >>> data = env.reset()
+    >>> data["observation"].shape, data["goal_observation"].shape
+    (torch.Size([2, 4, 1280]), torch.Size([2, 1280]))
+    >>> bool((data["observation"] == scenes.features[data["state_id"], 0]).all())
+    True
+    """
+
+    def __init__(
+        self,
+        scenes: SceneSet,
+        kind: str = "features",
+        crop: str | int = "first",
+        size: tuple[int, int] | None = None,
+        in_keys: Sequence[NestedKey] = ("state_id", "goal_id"),
+        out_keys: Sequence[NestedKey] = ("observation", "goal_observation"),
+    ) -> None:
+        super().__init__(in_keys=list(in_keys), out_keys=list(out_keys))
+        if kind not in ("features", "pixels"):
+            raise ConfigError(f"kind is {kind!r}; it is 'features' or 'pixels'")
+        crops = scenes.num_crops if kind == "features" else 1
+        index = {"first": 0, "random": None}.get(crop, -1) if isinstance(crop, str) else crop
+        if index is not None and not 0 <= index < crops:
+            raise ConfigError(
+                f"crop is {crop!r}; give 'first', 'random', or an index below {crops} for {kind}"
+            )
+        if kind == "pixels" and not all(scene.has_pictures for scene in scenes.scenes):
+            without = next(scene.name for scene in scenes.scenes if not scene.has_pictures)
+            raise SceneError(
+                f"scene {without!r} has no pictures; use kind='features', or a file with pictures"
+            )
+        self.scenes = scenes.to("cpu")
+        self.kind = kind
+        self.size = size
+        self.crop = index
+        self.crops = crops
+        # Not a buffer: it is built when it is needed, and neither saved nor pickled.
+        self.__dict__["_table"] = None
+
+    def _apply_transform(self, obs: Tensor) -> Tensor:
+        table = self.__dict__["_table"]
+        if table is None or table.device != obs.device:
+            table = observation_table(self.scenes, self.kind, self.size).to(obs.device)
+            table = self.__dict__["_table"] = (
+                table if self.crop is None else table[:, self.crop : self.crop + 1].contiguous()
+            )
+        entry = obs.reshape(-1)
+        if self.crop is None:
+            drawn = torch.randint(self.crops, entry.shape, generator=self._generator(), device=obs.device)
+            entry = entry * self.crops + drawn
+        found = table.flatten(0, 1).index_select(0, entry)
+        return found.reshape(*obs.shape, *found.shape[1:])
+
+    def _generator(self) -> torch.Generator | None:
+        env: Any = self.container
+        while isinstance(env, TransformedEnv):
+            env = env.base_env
+        return env.generator if isinstance(env, TargetNavEnv) else None
+
+    def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
+        return self._call(tensordict_reset)
+
+    def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
+        """Add the keys that are written."""
+        assert isinstance(observation_spec, Composite)
+        for in_key, out_key in zip(self.in_keys, self.out_keys, strict=True):
+            ids = observation_spec[in_key]
+            observation_spec[out_key] = self._spec(ids.shape, ids.device)
+        return observation_spec
+
+    def _spec(self, shape: torch.Size, device: torch.device | None) -> TensorSpec:
+        if self.kind == "features":
+            return Unbounded((*shape, self.scenes.feature_size), dtype=torch.float32, device=device)
+        height, width = self.size or self.scenes.scenes[0].picture_shape[:2]  # type: ignore[index]
+        return Bounded(0, 255, (*shape, 3, height, width), dtype=torch.uint8, device=device)
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**super().__getstate__(), "_table": None}
