@@ -7,12 +7,19 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
+import numpy as np
 import pytest
 import torch
+from tensordict import TensorDict
+from torch import Tensor
+from torchrl.objectives import A2CLoss, LossModule
 
 from vusfa.envs import TargetNavEnv
+from vusfa.modules import Agent, make_agent
+from vusfa.objectives import TFRMSprop, USFLoss
+from vusfa.objectives.functional import dual_ascent
 from vusfa.scenes import Scene, SceneSet
 
 
@@ -99,3 +106,306 @@ class TestEnvironment:
         seen = env.reset()["state_id"].unique().tolist()
         assert seen == (cut.distance[:, goal] > 0).nonzero()[:, 0].tolist()
         assert set(seen) <= set(traces["reset"]["states_seen_when_rows_blocked"])
+
+
+# Layer names of the golden files, in our agents. `encoder` is the siamese encoder, which the bottleneck of M4
+# wraps; policy heads of one and of two layers are told apart below.
+LAYERS = {
+    "fc1": "encoder.branch.first",
+    "fc1_s1": "encoder.branch.last",
+    "fc1_g": "encoder.goal_branch.first",
+    "fc1_t1": "encoder.goal_branch.last",
+    "fc1_siamese": "encoder.state_layer",
+    "fc2": "fusion.linear",
+    "fc3": "scene_layer.linear",
+    "policy_h": "policy.first",
+    "policy": "policy.last",
+    "value": "value.linear",
+    "usf": "successor.linear",
+    "fc1_r1": "reward.first",
+    "fc1_rw": "reward.last",
+}
+# golden file: our model, coefficient of the successor features' loss, relative tolerance of gradient norms
+MODELS = {
+    "m1_gvf": ("gvf", None, 1e-5),
+    "m2_usfa": ("usfa", 5e-4, 1e-5),
+    "m3_sfdp": ("sfdp", 5e-3, 1e-5),
+    "m4_vusfa": ("vusfa", 5e-4, 3e-4),
+}
+
+
+class Released(NamedTuple):
+    """One released model, rebuilt: our agent with its weights, the batch it was fed, and what came out."""
+
+    name: str
+    about: dict[str, Any]
+    arrays: dict[str, np.ndarray]
+    agent: Agent
+    batch: TensorDict
+
+
+def parameter(agent: Agent, variable: dict[str, Any]) -> torch.nn.Parameter:
+    """Our parameter that holds a golden variable (of all scenes, where each scene has its own)."""
+    module = agent.encoder.encoder if agent.config["model"] == "vusfa" else agent.encoder
+    path = LAYERS[variable["layer"]].removeprefix("encoder.")
+    if path == LAYERS[variable["layer"]]:
+        module = agent
+    if path == "policy.last" and not hasattr(agent.policy, "last"):
+        path = "policy.linear"
+    return module.get_parameter(f"{path}.{'weight' if variable['kind'] == 'W' else 'bias'}")
+
+
+def as_golden(tensor: Tensor, variable: dict[str, Any]) -> Tensor:
+    """A view of our parameter, or of anything of its shape, in the golden layout: [in, out], one scene.
+
+    The first layer reads frames flattened as feature * H + h there; here it has a weight (out, F) a frame.
+    """
+    if variable["scene"] is not None:
+        tensor = tensor[int(variable["scene"].removeprefix("scene_"))]
+    if variable["kind"] == "b":
+        return tensor
+    return tensor.permute(2, 0, 1) if tensor.dim() == 3 else tensor.T
+
+
+def two_scenes() -> SceneSet:
+    """Scenes of as many features and actions; the agents are fed features, not states of these."""
+    graph = torch.tensor([[1, -1, -1, -1], [0, -1, -1, -1]])
+    return SceneSet([Scene(f"scene_{i}", graph, torch.ones(2, 1, 2048)) for i in range(2)])
+
+
+def rebuild(golden: Path, name: str) -> Released:
+    about = json.loads((golden / f"{name}.json").read_text())
+    with np.load(golden / f"{name}.npz") as stored:
+        arrays = dict(stored)
+    seed, history, steps = about["seed"], about["history_length"], about["T"]
+    agent = make_agent(MODELS[name][0], "reference", two_scenes(), observation="features")
+    with torch.no_grad():
+        for variable, total in zip(about["variables"], about["checks"]["weight_sums"], strict=True):
+            bound = 1 / np.sqrt(variable["fan_in"])
+            draw = np.random.default_rng([seed, variable["index"]]).uniform(-bound, bound, variable["shape"])
+            assert draw.astype(np.float32).sum(dtype=np.float64) == pytest.approx(total, abs=1e-6)
+            view = as_golden(parameter(agent, variable), variable)
+            view.copy_(torch.from_numpy(draw.astype(np.float32)).view(view.shape))
+    rng = np.random.default_rng([seed, 1000])
+    s, t = (
+        torch.from_numpy((abs(rng.standard_normal((steps, 2048, history))) * 0.5).astype(np.float32))
+        for _ in range(2)
+    )
+    actions = torch.from_numpy(rng.integers(0, 4, size=steps))
+    assert actions.tolist() == about["checks"]["actions"]
+    advantage, value_target, successor_target = (
+        torch.from_numpy(rng.standard_normal(shape).astype(np.float32))
+        for shape in ((steps, 1), (steps, 1), (steps, 512))
+    )
+    batch = {
+        "observation": s.mT,
+        "goal_observation": t.mT,
+        "scene_id": torch.zeros(steps, dtype=torch.int64),
+        "action": actions,
+        "advantage": advantage,
+        "value_target": value_target,
+        "successor_target": successor_target,
+    }
+    return Released(name, about, arrays, agent, TensorDict(batch, [steps]))
+
+
+def close(ours: Tensor, theirs: np.ndarray, tolerance: float = 1e-5) -> None:
+    theirs = torch.from_numpy(np.asarray(theirs, dtype=np.float64))
+    torch.testing.assert_close(ours.detach().double().reshape(theirs.shape), theirs, rtol=0, atol=tolerance)
+
+
+@pytest.fixture(scope="module", params=MODELS)
+def released(request: pytest.FixtureRequest, golden: Path) -> Released:
+    return rebuild(golden, request.param)
+
+
+class TestModels:
+    """m1_gvf .. m4_vusfa: forward pass, every loss term, every gradient, two steps of the optimiser."""
+
+    @pytest.fixture
+    def noise(self, released: Released, monkeypatch: pytest.MonkeyPatch) -> None:
+        """The noise that the released code drew, in place of ours."""
+        if released.agent.latent is not None:
+            eps = torch.from_numpy(released.arrays["eps_t"])
+            monkeypatch.setattr(released.agent.latent, "noise", lambda loc: eps)
+
+    def test_every_weight_is_ours_and_none_of_ours_is_left(self, released: Released) -> None:
+        variables = released.about["variables"]
+        held = {id(parameter(released.agent, variable)) for variable in variables}
+        assert held == {id(ours) for ours in released.agent.parameters()}
+        assert sum(int(np.prod(v["shape"])) for v in variables) == sum(
+            ours.numel() for ours in released.agent.parameters()
+        )
+
+    @pytest.mark.usefixtures("noise")
+    def test_forward(self, released: Released) -> None:
+        agent, arrays = released.agent, released.arrays
+        critic = agent.get_value_operator()(released.batch.clone())
+        actor = agent.get_policy_operator().get_dist_params(released.batch.clone())
+        embeddings = torch.cat([critic["state_embedding"], critic["goal_embedding"]], -1)
+        close(embeddings, arrays["fusion_in"])
+        close(critic["state_value"], arrays["v"])
+        close(actor["logits"], arrays["logits"])
+        close(actor["logits"].softmax(-1), arrays["pi"])
+        if agent.successor is not None:
+            close(critic["successor_features"], arrays["usf"])
+            close(critic["reward_weights"], arrays["omega"])
+            close(critic["state_embedding"], arrays["state_rep"])
+        if agent.latent is not None:
+            for ours, theirs in (
+                ("state_loc", "mu_s"),
+                ("state_scale", "sigma_s"),
+                ("goal_loc", "mu_t"),
+                ("goal_scale", "sigma_t"),
+            ):
+                close(critic[ours], arrays[theirs])
+            assert (arrays["logits_prerelu"] < 0).any()  # so that the ReLU shows
+            close(actor["logits"], arrays["logits_prerelu"].clip(min=0))
+
+    @pytest.mark.usefixtures("noise")
+    def test_the_other_scenes_layers(self, released: Released) -> None:
+        agent, arrays = released.agent, released.arrays
+        elsewhere = released.batch.clone().set("scene_id", torch.ones_like(released.batch["scene_id"]))
+        critic = agent.get_value_operator()(elsewhere)
+        close(critic["state_value"], arrays["v_scene1"])
+        inputs = [critic["hidden"]]
+        if agent.successor is not None:
+            close(critic["successor_features"], arrays["usf_scene1"])
+        if hasattr(agent.policy, "first"):
+            inputs.append(torch.from_numpy(arrays["usf"]))  # the golden run fed scene_0's here, too
+        close(agent.policy(*inputs, elsewhere["scene_id"]).softmax(-1), arrays["pi_scene1"])
+
+    def test_mixed_scenes_in_one_batch(self, released: Released) -> None:
+        """Rows of both scenes at once give what each scene gives alone."""
+        scene_id = torch.arange(len(released.batch)) % 2
+        released.agent.eval()
+        outputs = [
+            released.agent.get_value_operator()(released.batch.clone().set("scene_id", scene))
+            for scene in (scene_id, torch.zeros_like(scene_id), torch.ones_like(scene_id))
+        ]
+        released.agent.train()
+        for key in ("hidden", "state_value"):
+            mixed, first, second = (output[key] for output in outputs)
+            torch.testing.assert_close(mixed, torch.where(scene_id.unsqueeze(-1) == 0, first, second))
+
+    def losses(self, released: Released) -> list[LossModule]:
+        """Our losses for the model, with the coefficients that make them sums over T steps."""
+        steps, (_, successor_coeff, _) = released.about["T"], MODELS[released.name]
+        networks = released.agent.get_policy_operator(), released.agent.get_value_operator()
+        usf = USFLoss(
+            *networks,
+            objective_coeff=steps,
+            entropy_coeff=0.01 * steps,
+            critic_coeff=0.25 * steps,
+            successor_coeff=successor_coeff,
+            bottleneck_coeff=released.about["beta"],
+        )
+        if released.name != "m1_gvf":
+            return [usf]
+        return [
+            usf,
+            A2CLoss(*networks, entropy_coeff=0.01, critic_coeff=0.25, loss_critic_type="l2", reduction="sum"),
+        ]
+
+    @pytest.mark.usefixtures("noise")
+    def test_every_term_of_the_loss(self, released: Released) -> None:
+        arrays = released.arrays
+        for loss in self.losses(released):
+            terms = loss(released.batch.clone())
+            close(terms["loss_objective"] + terms["loss_entropy"], arrays["policy_loss"])
+            close(terms["loss_critic"], arrays["value_loss"])
+            log_prob = (
+                released.agent.get_policy_operator()
+                .get_dist(released.batch.clone())
+                .log_prob(released.batch["action"])
+            )
+            close(log_prob * released.batch["advantage"][:, 0], arrays["logpi_a_td"])
+            close(-terms["loss_objective"], arrays["logpi_a_td"].sum())
+            close(-terms["loss_entropy"] / 0.01, arrays["entropy"].sum())
+            if "sr_loss" in arrays:
+                close(terms["loss_successor"], arrays["sr_loss"], 1e-8)
+                close(terms["loss_successor"] / MODELS[released.name][1], arrays["sr_mse"])
+            if "kl_mean" in arrays:
+                close(terms["kl"], arrays["kl_mean"])
+                close(terms["kl"] - 0.2, arrays["bottle_neck"])
+                close(terms["loss_bottleneck"], arrays["beta_term"])
+            total = sum(value for key, value in terms.items() if key.startswith("loss"))
+            close(total, arrays["total_loss"])
+            assert ("sr_loss" in arrays) == ("loss_successor" in sorted(terms.keys()))
+            assert ("kl_mean" in arrays) == ("loss_bottleneck" in sorted(terms.keys()))
+
+    def test_every_step_of_the_multiplier(self, golden: Path) -> None:
+        with np.load(golden / "m4_vusfa.npz") as stored:
+            cases = torch.from_numpy(stored["beta_update_cases"])
+        for old, violation, new in cases:
+            torch.testing.assert_close(dual_ascent(old, violation, 1e-6), new, rtol=1e-6, atol=1e-12)
+
+    @pytest.mark.usefixtures("noise")
+    def test_every_gradient_and_two_steps_of_the_optimiser(self, released: Released) -> None:
+        agent, variables = released.agent, released.about["variables"]
+        for loss in self.losses(released):
+            before = {name: weight.detach().clone() for name, weight in agent.named_parameters()}
+            agent.zero_grad()
+            terms = loss(released.batch.clone())
+            sum(value for key, value in terms.items() if key.startswith("loss")).backward()
+            self.compare_gradients(released)
+            rule = released.about["optimiser"]
+            optimiser = TFRMSprop(
+                agent.parameters(),
+                lr=rule["lr"],
+                alpha=rule["decay"],
+                eps=rule["epsilon"],
+                initial_accumulator=rule["rms_init"],
+                max_grad_norm=rule["clip_norm_per_variable"],
+            )
+            for step in (1, 2):
+                previous = [parameter(agent, v).detach().clone() for v in variables]
+                optimiser.step()
+                self.compare_step(released, optimiser, previous, f"step{step}")
+            agent.load_state_dict(before)
+
+    def compare_gradients(self, released: Released) -> None:
+        arrays, seed = released.arrays, released.about["seed"]
+        tolerance = MODELS[released.name][2]
+        for variable in released.about["variables"]:
+            index = variable["index"]
+            gradient = as_golden(parameter(released.agent, variable).grad, variable).reshape(
+                variable["shape"]
+            )
+            if not arrays["grad_present"][index]:
+                assert not gradient.any(), variable["name"]
+                continue
+            gradient = gradient.double()
+            norm = arrays["grad_l2"][index]
+            assert gradient.norm().item() == pytest.approx(norm, rel=tolerance), variable["name"]
+            # sums of up to 4 million float32 numbers, most of which cancel
+            total = pytest.approx(arrays["grad_sum"][index], abs=3e-3, rel=tolerance)
+            assert gradient.sum().item() == total, variable["name"]
+            direction = np.random.default_rng([seed, 2000 + index]).standard_normal(variable["shape"])
+            along = (gradient * torch.from_numpy(direction)).sum().item()
+            assert along == pytest.approx(arrays["grad_proj"][index], abs=10 * tolerance * norm), variable[
+                "name"
+            ]
+            first = arrays["grad_first16"][index]
+            close(gradient.flatten()[:16], first[~np.isnan(first)], 2e-6)
+
+    def compare_step(
+        self, released: Released, optimiser: TFRMSprop, previous: list[Tensor], step: str
+    ) -> None:
+        arrays = released.arrays
+        for variable, old in zip(released.about["variables"], previous, strict=True):
+            index, ours = variable["index"], parameter(released.agent, variable)
+            delta = as_golden(ours.detach() - old, variable).reshape(variable["shape"]).flatten()
+            if not arrays["grad_present"][index]:
+                assert not delta.any(), variable["name"]  # the other scene's weights stay bit for bit
+                continue
+            first = arrays[f"{step}_delta_first16"][index]
+            close(delta[:16], first[~np.isnan(first)], 2.4e-7)
+            size = len(delta) ** 0.5
+            # a variable moves by whole float32 units, and there are as many of them as elements
+            close(delta.double().norm(), arrays[f"{step}_update_l2"][index], 1.2e-7 * size + 1e-7)
+            accumulator = as_golden(optimiser.state[ours]["square_avg"], variable)
+            accumulator = accumulator.reshape(variable["shape"]).flatten()
+            first = arrays[f"{step}_rms_first16"][index]
+            close(accumulator[:16], first[~np.isnan(first)], 2e-7)
+            close(accumulator.double().norm(), arrays[f"{step}_rms_l2"][index], 2e-7 * size)

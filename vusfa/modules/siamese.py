@@ -104,7 +104,8 @@ class SiameseEncoder(nn.Module):
         Args:
             observation: features (\\*B, H, F) or pictures (\\*B, H, 3, h, w) uint8, oldest first. Of a longer
                 history the last H frames are read.
-            goal_observation: (\\*B, F) or (\\*B, 3, h, w).
+            goal_observation: (\\*B, F) or (\\*B, 3, h, w), one frame that fills all H places; or shaped as
+                ``observation``, for a goal that is H frames itself.
 
         Returns:
             codes of state and goal, (\\*B, out) each.
@@ -112,13 +113,17 @@ class SiameseEncoder(nn.Module):
         Raises:
             ConfigError: fewer than H frames.
         """
+        state = self.branch.finish(self._first(self.branch, observation, "observation"), self.state_layer)
+        branch = self.goal_branch or self.branch
+        if goal_observation.dim() == observation.dim():
+            return state, branch.finish(self._first(branch, goal_observation, "goal_observation"))
+        return state, branch.finish(branch.first.repeated(self.frames.encode(goal_observation)))
+
+    def _first(self, branch: Branch, frames: Tensor, key: str) -> Tensor:
         place = -1 - self.frames.frame_dims
-        frames = observation.size(place)
-        self._check_history(frames, "observation")
-        history = observation.narrow(place, frames - self.history, self.history)
-        state = self.branch.finish(self.branch.first(self.frames.encode(history)), self.state_layer)
-        goal_branch = self.goal_branch or self.branch
-        return state, goal_branch.finish(goal_branch.first.repeated(self.frames.encode(goal_observation)))
+        self._check_history(frames.size(place), key)
+        history = frames.narrow(place, frames.size(place) - self.history, self.history)
+        return branch.first(self.frames.encode(history))
 
     def from_ids(self, state_id: Tensor, goal_id: Tensor) -> tuple[Tensor, Tensor]:
         """Codes of states by id: each distinct state of the batch is encoded once.
