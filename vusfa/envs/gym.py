@@ -304,11 +304,11 @@ class TargetNavVector(VectorEnv[Observation, np.ndarray, np.ndarray]):
         self._ended = terminated | truncated
         return self._task.observe(), reward, terminated, truncated, self._info(np.ones_like(again))
 
-    def render(self) -> tuple[np.ndarray, ...] | None:  # type: ignore[override]
+    def render(self) -> tuple[np.ndarray, ...] | None:
         """A picture of each row; None without a render mode."""
         return None if self.render_mode is None else tuple(map(self._task.render, range(self.num_envs)))
 
-    @property
+    @property  # type: ignore[misc]
     def np_random(self) -> tuple[np.random.Generator, ...]:  # type: ignore[override]
         """The generators of the rows."""
         return tuple(self._task.rows.rngs)
