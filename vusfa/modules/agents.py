@@ -32,7 +32,7 @@ from vusfa.modules.bottleneck import GaussianEncoder, LatentSampler
 from vusfa.modules.frames import FeatureFrames, PictureFrames, picture_table
 from vusfa.modules.policy import PolicyHead, SuccessorPolicyHead
 from vusfa.modules.presets import AgentConfig, resolve_config
-from vusfa.modules.siamese import SiameseEncoder
+from vusfa.modules.siamese import NormalisedEncoder, SiameseEncoder
 from vusfa.modules.successor import RewardHead, SuccessorHead, SuccessorValue, ValueHead
 from vusfa.modules.trunk import Fusion, SceneLayer
 
@@ -105,8 +105,10 @@ class Agent(nn.Module):
         self.fusion = Fusion(size, hidden)
         self.scene_layer = SceneLayer(num_scenes, hidden, hidden)
         self.latent = LatentSampler(config.eval_latent) if ideas.bottleneck else None
-        self.successor = SuccessorHead(num_scenes, hidden, size) if ideas.successor_value else None
-        self.reward = RewardHead(size, hidden) if ideas.successor_value else None
+        self.successor = (
+            SuccessorHead(num_scenes, hidden, size, config.successor_scale) if ideas.successor_value else None
+        )
+        self.reward = RewardHead(size, hidden, config.reward_scale) if ideas.successor_value else None
         self.value = SuccessorValue() if ideas.successor_value else ValueHead(num_scenes, hidden)
         self.policy: nn.Module = PolicyHead(num_scenes, hidden, scenes.num_actions)
         if ideas.successor_policy:
@@ -216,7 +218,10 @@ def _make_encoder(config: AgentConfig, scenes: Any) -> nn.Module:
         state_layer=config.state_layer,
         by_id=by_id,
     )
-    return GaussianEncoder(encoder, config.scale, config.initial_scale) if bottleneck else encoder
+    embeddings: nn.Module = encoder
+    if bottleneck:
+        embeddings = GaussianEncoder(encoder, config.scale, config.initial_scale)
+    return NormalisedEncoder(embeddings) if config.normalise_embedding else embeddings
 
 
 def _plain(config: AgentConfig, scenes: Any) -> dict[str, Any]:

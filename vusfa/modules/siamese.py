@@ -13,7 +13,7 @@ batch once:
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 import torch
@@ -24,7 +24,7 @@ from vusfa.errors import ConfigError
 from vusfa.modules.frames import FeatureFrames, PictureFrames
 from vusfa.modules.linear import HistoryLinear
 
-__all__ = ["Branch", "SiameseEncoder", "frozen"]
+__all__ = ["Branch", "NormalisedEncoder", "SiameseEncoder", "frozen"]
 
 
 class Branch(nn.Module):
@@ -216,6 +216,38 @@ class SiameseEncoder(nn.Module):
                 f"{key} has {frames} frames a row and the agent reads {self.history};"
                 f" give the environment history={self.history}, or the agent history={frames}"
             )
+
+
+class NormalisedEncoder(nn.Module):
+    """An encoder whose two embeddings are brought to mean 0 and deviation 1 over their E dimensions.
+
+    phi is then of one size whatever the weights do. Without it, phi, psi and V = psi . omega can drive each
+    other up without bound; with a bottleneck, pi and psi go on reading full-sized means while the KL term
+    presses the means that omega's sample is made of towards 0. What else the encoder returns (the Gaussians'
+    means and scales) passes as it is.
+
+    Args:
+        encoder: returns the two embeddings first, (\\*B, E) each.
+
+    >>> encoder = NormalisedEncoder(lambda state, goal: (2 * state, goal - 5.0, state))
+    >>> state, goal, loc = encoder(torch.tensor([[-1.0, 1.0]]), torch.tensor([[3.0, 1.0]]))
+    >>> state.round(decimals=3), goal.round(decimals=3), loc
+    (tensor([[-1.,  1.]]), tensor([[ 1., -1.]]), tensor([[-1.,  1.]]))
+    """
+
+    def __init__(self, encoder: Callable[..., tuple[Tensor, ...]]) -> None:
+        super().__init__()
+        self.encoder = encoder
+
+    def forward(self, state: Tensor, goal: Tensor) -> tuple[Tensor, ...]:
+        """The encoder's outputs, the first two normalised."""
+        state_embedding, goal_embedding, *rest = self.encoder(state, goal)
+        size = state_embedding.shape[-1:]
+        return (
+            functional.layer_norm(state_embedding, size),
+            functional.layer_norm(goal_embedding, size),
+            *rest,
+        )
 
 
 @contextmanager

@@ -21,19 +21,22 @@ class SuccessorHead(nn.Module):
         num_scenes: scenes with weights of their own.
         hidden_size: size of the hidden state.
         embedding_size: E, size of psi.
+        scale: factor on the layer's output. psi sums embeddings over about 1 / (1 - gamma) steps; with that
+            as the factor, the layer's own outputs are of the embeddings' size.
 
     >>> import torch
     >>> SuccessorHead(2, 32, 16)(torch.randn(5, 32), torch.tensor([0, 1, 1, 0, 1])).shape
     torch.Size([5, 16])
     """
 
-    def __init__(self, num_scenes: int, hidden_size: int, embedding_size: int) -> None:
+    def __init__(self, num_scenes: int, hidden_size: int, embedding_size: int, scale: float = 1.0) -> None:
         super().__init__()
         self.linear = SceneLinear(num_scenes, hidden_size, embedding_size)
+        self.scale = scale
 
     def forward(self, hidden: Tensor, scene_id: Tensor) -> Tensor:
         """(\\*B, hidden_size) with scene indices (\\*B,) to (\\*B, E) float32."""
-        return self.linear(hidden, scene_id).float()
+        return self.scale * self.linear(hidden, scene_id).float()
 
 
 class RewardHead(nn.Module):
@@ -42,20 +45,23 @@ class RewardHead(nn.Module):
     Args:
         embedding_size: E, size of the goal's embedding and of omega.
         hidden_size: outputs of the first layer.
+        scale: factor on the last layer's output. V is a sum of E products, so a step of the optimiser moves
+            it by E times what it moves a weight; a small factor keeps that step small.
 
     >>> import torch
     >>> RewardHead(16, 32)(torch.randn(5, 16)).shape
     torch.Size([5, 16])
     """
 
-    def __init__(self, embedding_size: int, hidden_size: int) -> None:
+    def __init__(self, embedding_size: int, hidden_size: int, scale: float = 1.0) -> None:
         super().__init__()
+        self.scale = scale
         self.first = nn.Linear(embedding_size, hidden_size)
         self.last = nn.Linear(hidden_size, embedding_size)
 
     def forward(self, goal: Tensor) -> Tensor:
         """Goal embedding, or a sample of it, (\\*B, E) to (\\*B, E) float32."""
-        return self.last(functional.relu(self.first(goal))).float()
+        return self.scale * self.last(functional.relu(self.first(goal))).float()
 
 
 class SuccessorValue(nn.Module):
