@@ -44,7 +44,8 @@ def golden(request: pytest.FixtureRequest) -> Path:
 
 
 def grid_scene(name: str = "hall", width: int = 2, height: int = 2, features: int = 8) -> Scene:
-    """An empty room of width x height places with four headings each: 4 N states, no island, shortest paths of a few steps.
+    """An empty room of width x height places with four headings each: 4 N states, no island, shortest paths
+    of a few steps.
 
     State = 4 * place + heading (0 is up, then clockwise); MoveForward, RotateRight, RotateLeft, MoveBackward.
     """

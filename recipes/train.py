@@ -1,0 +1,137 @@
+"""Trains one of the four models: python recipes/train.py agent.model=vusfa scenes=[bathroom]
+
+Settings are in recipes/conf/train.yaml and the folders beside it. The run's folder gets metrics.csv and
+checkpoint.pt, and at the end evaluation.csv, .json and evaluation_episodes.csv. To go on: python
+recipes/train.py resume=RUN/checkpoint.pt
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import torch
+from omegaconf import DictConfig, OmegaConf
+
+from vusfa.envs import resolve_goals
+from vusfa.evaluation import compare, print_summary
+from vusfa.modules import make_agent
+from vusfa.scenes import SceneSet
+from vusfa.training import (
+    ProgressLine,
+    Session,
+    StopOnSignal,
+    collecting,
+    descend,
+    learning_rate,
+    make_collector,
+    make_env,
+    make_loggers,
+    make_loss,
+    make_optimiser,
+    scene_sources,
+    total_loss,
+)
+from vusfa.training.launch import launch
+
+
+def train(cfg: DictConfig, overrides: list[str]) -> tuple[Session, int]:
+    """Trains, and leaves a checkpoint and an evaluation in ``cfg.folder``.
+
+    Args:
+        cfg: settings, as in recipes/conf/train.yaml.
+        overrides: the command line that made them, for whoever resumes.
+
+    Returns:
+        the session, and the exit code: 0, or 130 or 143 when a signal ended the training.
+    """
+    torch.manual_seed(cfg.seed)
+    device, folder = torch.device(cfg.device), Path(cfg.folder)
+    plain: dict[str, Any] = OmegaConf.to_container(cfg, resolve=True)  # type: ignore[assignment]
+
+    # The world, the agent, and what it learns by.
+    scenes = SceneSet.open(cfg.scenes)
+    goals = resolve_goals(scenes, plain["env"]["goals"])
+    agent = make_agent(scenes=scenes, **{k: v for k, v in plain["agent"].items() if v is not None}).to(device)
+    actor, critic = agent.get_policy_operator(), agent.get_value_operator()
+    loss, estimator, multiplier = make_loss(actor, critic, **plain["objective"])
+    optim = plain["optim"]
+    optimiser = make_optimiser(
+        agent.parameters(), optim["kind"], optim["lr"], optim["max_grad_norm"], **optim["options"]
+    )
+
+    # Who walks.
+    env = partial(
+        make_env, scenes, agent.make_env_transforms(), history=agent.config["history"], device=device
+    )
+    env = partial(env, **(plain["env"] | {"goals": goals}))
+    half = partial(torch.autocast, device.type, torch.bfloat16, enabled=cfg.autocast)
+    with half():
+        collector = make_collector(
+            make_env=env, policy=actor, seed=cfg.seed, autocast=cfg.autocast, **plain["collector"]
+        )
+
+    # What is saved, and who is told.
+    settings = {"config": plain, "overrides": overrides, "sources": scene_sources(cfg.scenes)}
+    session = Session(scenes, goals, agent, loss.to(device), optimiser, collector, settings)
+    if cfg.resume:
+        session.resume(cfg.resume)
+    resumed = session.frames if cfg.resume else None
+    loggers = make_loggers(
+        folder=folder, config=plain, run_id=session.run_id, resume_frames=resumed, **plain["logger"]
+    )
+    progress = ProgressLine(cfg.total_frames)
+
+    with StopOnSignal() as stop, collecting(collector) as batches:
+        while session.frames < cfg.total_frames and not stop.received:
+            began = time.monotonic()
+            with half():
+                batch = next(batches).to(device)
+                terms = loss(estimator(batch))
+            lr = learning_rate(session.frames, optim["lr"], optim["horizon"])
+            norm = descend(optimiser, total_loss(loss, terms), lr, optim["max_grad_norm"])
+            if multiplier is not None:
+                multiplier.step()
+
+            before = session.frames
+            session.count(batch, {**terms, "grad_norm": norm}, time.monotonic() - began)
+            progress.update(session.frames)
+            if before // cfg.log_every < session.frames // cfg.log_every:
+                metrics = session.metrics()
+                loggers.log_metrics(metrics, session.frames)
+                progress.rates(metrics["success"], metrics["length_ratio"])
+            if before // cfg.checkpoint_every < session.frames // cfg.checkpoint_every:
+                loggers.log_checkpoint(session.save(folder / "checkpoint.pt"), session.frames)
+        progress.close()
+        loggers.log_checkpoint(session.save(folder / "checkpoint.pt"), session.frames)
+
+    if cfg.evaluation.goals and not stop.received:
+        wanted = goals if cfg.evaluation.goals == "trained" else cfg.evaluation.goals
+        options = {k: v for k, v in plain["evaluation"].items() if k != "goals"}
+        result = compare(
+            {agent.config["model"]: actor},
+            scenes,
+            wanted,
+            trained=goals,
+            history=agent.config["history"],
+            **options,
+        )
+        result.save(folder / "evaluation")
+        loggers.log_table("evaluation", result.rows, session.frames)
+        print_summary(result.rows, note=result.note)
+    loggers.close(stop.exit_code)
+    return session, stop.exit_code
+
+
+def main(cfg: DictConfig, overrides: list[str]) -> int:
+    """Trains, says where the results are."""
+    _, exit_code = train(cfg, overrides)
+    print(f"{cfg.folder}/checkpoint.pt", file=sys.stderr)
+    return exit_code
+
+
+if __name__ == "__main__":
+    launch(main, Path(__file__).parent / "conf", "train")

@@ -1,0 +1,79 @@
+"""Every state a goal: python recipes/zero_shot.py runs/.../checkpoint.pt
+
+As the paper's Table 1: for every state of every scene as a goal, 10 episodes from random starts, 500 steps,
+sampled actions. Trained and unseen goals apart, beside the random walk, the untrained network and the
+shortest path. The tables go to the terminal; zero_shot.csv, zero_shot.json and zero_shot_episodes.csv beside
+the checkpoint.
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Literal
+
+import torch
+import tyro
+from rich.progress import Progress
+
+from vusfa.errors import VusfaError
+from vusfa.evaluation import compare, print_summary
+from vusfa.training import load_agent, rebuild_agent
+
+
+def zero_shot(
+    checkpoint: Path,
+    /,
+    *,
+    episodes: int = 10,
+    max_steps: int = 500,
+    goals: str = "all",
+    greedy: bool = False,
+    unreachable: Literal["skip", "fail"] = "skip",
+    seed: int = 0,
+    device: str = "cpu",
+    out: Path | None = None,
+) -> None:
+    """Evaluate a checkpoint of recipes/train.py.
+
+    Args:
+        checkpoint: the file.
+        episodes: for every goal.
+        max_steps: actions allowed in an episode.
+        goals: all, paper, random:5 (a scene), or a manifest (.yaml).
+        greedy: take the most probable action instead of drawing one.
+        unreachable: pairs of start and goal without a path: skip leaves them out, fail counts them as
+            failures.
+        seed: of starts, actions and the untrained network.
+        device: where to compute.
+        out: where to write, without suffix; zero_shot beside the checkpoint when not given.
+    """
+    agent, scenes, state = load_agent(checkpoint, device=device)
+    torch.manual_seed(seed)
+    untrained = rebuild_agent(agent.config, scenes).to(device)
+    policies = {agent.config["model"]: agent, "untrained": untrained}
+    with Progress(transient=True) as bar:
+        tasks = {name: bar.add_task(name, total=None) for name in policies}
+        result = compare(
+            {name: policy.get_policy_operator() for name, policy in policies.items()},
+            scenes,
+            goals,
+            trained=state["goals"],
+            progress=lambda name, done, total: bar.update(tasks[name], completed=done, total=total),
+            episodes_per_goal=episodes,
+            max_steps=max_steps,
+            history=agent.config["history"],
+            sample=not greedy,
+            unreachable=unreachable,
+            seed=seed,
+        )
+    print_summary(result.rows, note=result.note)
+    for path in result.save(out or checkpoint.with_name("zero_shot")):
+        print(path)
+
+
+if __name__ == "__main__":
+    try:
+        tyro.cli(zero_shot)
+    except VusfaError as error:
+        sys.exit(f"error: {error}")

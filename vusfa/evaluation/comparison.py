@@ -1,0 +1,100 @@
+"""An agent beside what it must be compared with: random walk, untrained network, shortest path."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
+
+from vusfa.envs.goals import resolve_goals
+from vusfa.evaluation.episodes import Episodes
+from vusfa.evaluation.files import write_csv, write_json
+from vusfa.evaluation.floors import shortest_paths
+from vusfa.evaluation.navigation import evaluate
+from vusfa.evaluation.report import count_pairs, random_walk_summary, summary
+from vusfa.scenes import SceneSet
+
+__all__ = ["Comparison", "compare"]
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Results of :func:`compare`.
+
+    Attributes:
+        episodes: what the agent walked.
+        rows: the summaries of all policies, see :func:`vusfa.evaluation.summary`.
+        settings: how this was measured; plain data.
+        note: how unreachable pairs are counted, in words.
+    """
+
+    episodes: Episodes
+    rows: list[dict[str, Any]]
+    settings: dict[str, Any]
+    note: str
+
+    def save(self, stem: str | Path) -> list[Path]:
+        """Write ``STEM.csv`` (the summary), ``STEM.json`` (summary and settings) and ``STEM_episodes.csv``,
+        atomically.
+
+        Returns:
+            the three paths.
+        """
+        stem = Path(stem)
+        return [
+            write_csv(stem.with_name(f"{stem.name}.csv"), self.rows),
+            write_json(
+                stem.with_name(f"{stem.name}.json"),
+                {"settings": self.settings, "note": self.note, "rows": self.rows},
+            ),
+            self.episodes.write_csv(stem.with_name(f"{stem.name}_episodes.csv")),
+        ]
+
+
+def compare(
+    policies: dict[str, TensorDictModuleBase],
+    scenes: SceneSet,
+    goals: Any,
+    *,
+    trained: Tensor,
+    within: Sequence[int] = (500, 100),
+    progress: Callable[[str, int, int], None] | None = None,
+    **settings: Any,
+) -> Comparison:
+    """Evaluates policies on the same episodes, and puts the random walk and the shortest path beside them.
+
+    Args:
+        policies: by what to call them; the first one's episodes are kept.
+        scenes: the world.
+        goals: global state ids, or whatever :func:`vusfa.envs.goals.resolve_goals` takes.
+        trained: global ids of the goals that the first policy was trained on.
+        within: numbers of actions to give the success for.
+        progress: called with (policy, episodes finished, episodes in all).
+        settings: of :func:`vusfa.evaluation.evaluate`.
+
+    Raises:
+        GoalError: a goal that does not exist, or none that can be reached.
+    """
+    goal_ids = resolve_goals(scenes, goals)
+    rows: list[dict[str, Any]] = []
+    tables: list[Episodes] = []
+    for name, policy in policies.items():
+        told = None if progress is None else _named(progress, name)
+        table = evaluate(policy, scenes, goal_ids, trained=trained, progress=told, **settings)
+        rows += summary(table, name, within)
+        tables.append(table)
+    unreachable = settings.get("unreachable", "skip")
+    limit = tables[0].max_steps
+    rows += random_walk_summary(scenes, goal_ids, trained, limit, within, unreachable)
+    rows += summary(shortest_paths(tables[0]), "shortest path", within)
+    plain = {key: value for key, value in settings.items() if key != "observe"}
+    plain |= {"scenes": list(scenes.names), "goals": goals if isinstance(goals, str) else goal_ids.tolist()}
+    return Comparison(tables[0], rows, plain, count_pairs(scenes.scenes, unreachable))
+
+
+def _named(progress: Callable[[str, int, int], None], name: str) -> Callable[[int, int], None]:
+    return lambda finished, total: progress(name, finished, total)

@@ -1,0 +1,81 @@
+"""The table an evaluation yields: one row an episode, kept as columns."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from vusfa.evaluation.files import write_csv
+
+__all__ = ["Episodes"]
+
+_COLUMNS = ("scene", "goal", "start", "success", "length", "shortest", "collisions", "trained")
+
+
+@dataclass(frozen=True, eq=False)
+class Episodes:
+    """Episodes that one policy walked; every column a tensor (n,) on the CPU.
+
+    Args:
+        scene: int64, index into ``scene_names``.
+        goal: int64, state id within its scene.
+        start: int64, state id within its scene.
+        success: bool, the goal was met within ``max_steps`` actions.
+        length: int64, actions taken (``max_steps`` when the goal was not met).
+        shortest: int64, fewest actions possible, -1 when the goal cannot be reached.
+        collisions: int64, actions that were blocked.
+        trained: bool, the goal is one of those the agent was trained on.
+        scene_names: names of the scenes.
+        max_steps: actions allowed in an episode.
+
+    >>> one = torch.tensor([1])
+    >>> table = Episodes(one * 0, one, one * 2, one > 0, one * 5, one * 4, one * 0, one > 0, ("hall",), 500)
+    >>> len(table), next(table.rows())["scene"], table.select(torch.tensor([False])).success.tolist()
+    (1, 'hall', [])
+    """
+
+    scene: Tensor
+    goal: Tensor
+    start: Tensor
+    success: Tensor
+    length: Tensor
+    shortest: Tensor
+    collisions: Tensor
+    trained: Tensor
+    scene_names: tuple[str, ...]
+    max_steps: int
+
+    def __post_init__(self) -> None:
+        shapes = {name: tuple(getattr(self, name).shape) for name in _COLUMNS}
+        if len(set(shapes.values())) != 1 or self.scene.ndim != 1:
+            raise ValueError(f"the columns of a table of episodes must all be (n,); they are {shapes}")
+
+    def __len__(self) -> int:
+        return self.scene.shape[0]
+
+    def select(self, rows: Tensor) -> Episodes:
+        """The episodes where ``rows`` (n,) bool is set."""
+        return replace(self, **{name: getattr(self, name)[rows] for name in _COLUMNS})
+
+    def rows(self) -> Iterator[dict[str, Any]]:
+        """One dictionary an episode, with the scene's name and plain Python values."""
+        columns = [getattr(self, name).tolist() for name in _COLUMNS]
+        for values in zip(*columns, strict=True):
+            row = dict(zip(_COLUMNS, values, strict=True))
+            row["scene"] = self.scene_names[row["scene"]]
+            yield row
+
+    def write_csv(self, path: str | Path) -> Path:
+        """Write one line an episode, atomically; truth values as 0 and 1."""
+        rows = ({k: int(v) if isinstance(v, bool) else v for k, v in row.items()} for row in self.rows())
+        return write_csv(path, rows, _COLUMNS)
+
+    def equal(self, other: Episodes) -> bool:
+        """Whether both tables hold the same numbers."""
+        pairs = ((getattr(self, f.name), getattr(other, f.name)) for f in fields(self))
+        return all(torch.equal(a, b) if isinstance(a, Tensor) else a == b for a, b in pairs)

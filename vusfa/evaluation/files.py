@@ -1,0 +1,81 @@
+"""Result files, written whole or not at all."""
+
+from __future__ import annotations
+
+import contextlib
+import csv
+import io
+import json
+import math
+import os
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+__all__ = ["replacing", "write_csv", "write_json"]
+
+
+@contextlib.contextmanager
+def replacing(path: str | Path) -> Iterator[Path]:
+    """Yields another name in the folder of ``path``; what was written there takes ``path``'s place at the
+    end.
+
+    Whoever reads ``path`` finds the old content or the new, never a part of it, whenever this process dies.
+    On an exception nothing is left behind.
+
+    >>> import tempfile
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     with replacing(Path(folder) / "deep" / "a.txt") as unfinished:
+    ...         _ = unfinished.write_text("whole")
+    ...     (Path(folder) / "deep" / "a.txt").read_text()
+    'whole'
+    """
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    unfinished = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    try:
+        yield unfinished
+        with open(unfinished, "rb") as file:
+            os.fsync(file.fileno())
+        os.replace(unfinished, path)
+    finally:
+        unfinished.unlink(missing_ok=True)
+
+
+def write_csv(
+    path: str | Path, rows: Iterable[Mapping[str, Any]], columns: Sequence[str] | None = None
+) -> Path:
+    """Write rows as CSV, atomically; the columns are those of the first row unless given. NaN becomes an
+    empty field."""
+    rows = list(rows)
+    names = list(columns if columns is not None else rows[0] if rows else [])
+    text = io.StringIO(newline="")
+    writer = csv.DictWriter(text, names, lineterminator="\n")
+    writer.writeheader()
+    for row in rows:
+        writer.writerow({key: "" if _is_nan(value) else value for key, value in row.items()})
+    return _write(path, text.getvalue())
+
+
+def write_json(path: str | Path, content: Any) -> Path:
+    """Write indented JSON, atomically; NaN, which JSON does not have, becomes null."""
+    text = json.dumps(_without_nan(content), indent=2, ensure_ascii=False, allow_nan=False)
+    return _write(path, text + "\n")
+
+
+def _write(path: str | Path, text: str) -> Path:
+    with replacing(path) as unfinished:
+        unfinished.write_text(text, encoding="utf-8")
+    return Path(path)
+
+
+def _is_nan(value: Any) -> bool:
+    return isinstance(value, float) and math.isnan(value)
+
+
+def _without_nan(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {key: _without_nan(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_without_nan(item) for item in value]
+    return None if _is_nan(value) else value

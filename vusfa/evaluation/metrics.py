@@ -1,0 +1,75 @@
+"""What a set of episodes amounts to: success, SPL, detour, collisions. Pure functions of tensors, one row an
+episode.
+
+The measures and their sources:
+
+- success within k steps: the agent stood on the goal after at most k actions.
+- SPL, success weighted by path length (Anderson et al. 2018, arXiv 1807.06757, eq. 1), counted in actions
+  instead of metres: the mean over episodes of ``success * shortest / max(length, shortest)``.
+- length over shortest path: mean length of the successful episodes over the mean of their shortest paths. A
+  ratio of means, not a mean of ratios: in the latter an episode that starts beside its goal weighs as much as
+  a long one.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+__all__ = ["length_ratio", "spl", "success_rate", "weighted_mean"]
+
+
+def success_rate(success: Tensor, length: Tensor, within: int) -> float:
+    """Share of the episodes that met their goal after at most ``within`` actions, NaN without episodes.
+
+    Args:
+        success: (n,) bool, the goal was met.
+        length: (n,) actions taken.
+        within: actions allowed.
+
+    >>> success_rate(torch.tensor([True, True, False]), torch.tensor([3, 80, 100]), within=50)
+    0.3333333333333333
+    """
+    return (success & (length <= within)).to(torch.float64).mean().item()
+
+
+def spl(success: Tensor, length: Tensor, shortest: Tensor) -> float:
+    """Success weighted by path length, in actions (Anderson et al. 2018, eq. 1), NaN without episodes.
+
+    Args:
+        success: (n,) bool, the goal was met.
+        length: (n,) actions taken.
+        shortest: (n,) fewest actions possible, -1 where there is no path (such an episode has failed).
+
+    >>> spl(torch.tensor([True, True, False]), torch.tensor([4, 8, 99]), torch.tensor([4, 4, 4]))
+    0.5
+    """
+    best = shortest.to(torch.float64)
+    taken = torch.maximum(length.to(torch.float64), best)
+    return torch.where(success, best / taken, 0.0).mean().item()
+
+
+def length_ratio(success: Tensor, length: Tensor, shortest: Tensor) -> float:
+    """Mean length of the successful episodes over the mean of their shortest paths, NaN when none succeeded.
+
+    >>> length_ratio(torch.tensor([True, True, False]), torch.tensor([4, 8, 99]), torch.tensor([4, 4, 4]))
+    1.5
+    """
+    taken = length[success].sum().item()
+    best = shortest[success].sum().item()
+    return taken / best if best else math.nan
+
+
+def weighted_mean(values: Sequence[float], weights: Sequence[float]) -> float:
+    """Mean of ``values`` weighted by ``weights``; a NaN value drops out with its weight, NaN when nothing is
+    left.
+
+    >>> weighted_mean([1.0, 0.5, math.nan], [1, 3, 9])
+    0.625
+    """
+    kept = [(v, w) for v, w in zip(values, weights, strict=True) if not math.isnan(v)]
+    total = sum(w for _, w in kept)
+    return sum(v * w for v, w in kept) / total if total else math.nan

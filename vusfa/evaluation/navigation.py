@@ -1,0 +1,268 @@
+"""Walks many episodes at once and writes down how each of them ended.
+
+The rules are the environment's own (:mod:`vusfa.envs.dynamics`), on a batch that shrinks: an episode that
+ends leaves it at once and one that waits takes the row, so that the few long episodes at the end cost what
+they weigh, not a full batch a step.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any, Literal
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor, nn
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+
+from vusfa.envs.dynamics import Rewards, start_history, step
+from vusfa.envs.goals import resolve_goals
+from vusfa.errors import ConfigError, GoalError
+from vusfa.evaluation.episodes import Episodes
+from vusfa.modules import frozen
+from vusfa.scenes import SceneSet
+
+__all__ = ["Unreachable", "episode_starts", "evaluate", "walk"]
+
+Unreachable = Literal["skip", "fail"]
+Observe = Callable[[TensorDictBase], TensorDictBase]
+Progress = Callable[[int, int], None]
+
+
+def episode_starts(
+    scenes: SceneSet,
+    goals: Tensor,
+    episodes_per_goal: int,
+    *,
+    unreachable: Unreachable = "skip",
+    generator: torch.Generator | None = None,
+) -> tuple[Tensor, Tensor]:
+    """Draws where each episode starts, uniformly, with replacement.
+
+    Args:
+        scenes: the world.
+        goals: (G,) global state ids.
+        episodes_per_goal: episodes for each of them.
+        unreachable: what to do with pairs of start and goal that no path joins. ``"skip"``: only states that
+            can reach the goal in more than 0 steps are starts, and a goal that none can reach gets no
+            episode. ``"fail"``: all other states of the scene are starts; from those without a path the agent
+            walks and fails.
+        generator: source of the draws, on the CPU.
+
+    Returns:
+        start and goal, both (n,) global ids, the episodes of one goal in a row, goals in the order given.
+
+    >>> scenes = SceneSet.bundled(["bathroom"])
+    >>> start, goal = episode_starts(scenes, torch.tensor([7, 3]), 2)
+    >>> goal.tolist(), bool((scenes.distance(start, goal) > 0).all())
+    ([7, 7, 3, 3], True)
+    """
+    if episodes_per_goal < 1:
+        raise ConfigError(f"episodes_per_goal is {episodes_per_goal}; it must be 1 or more")
+    if unreachable not in ("skip", "fail"):
+        raise ConfigError(f"unreachable is {unreachable!r}; it must be 'skip' or 'fail'")
+    starts, kept = [], []
+    for goal in goals.tolist():
+        first, last = _scene_range(scenes, goal)
+        states = torch.arange(first, last)
+        if unreachable == "skip":
+            allowed = states[scenes.distance(states, torch.full_like(states, goal)).cpu() > 0]
+        else:
+            allowed = states[states != goal]
+        if allowed.numel():
+            draw = torch.randint(allowed.numel(), (episodes_per_goal,), generator=generator)
+            starts.append(allowed[draw])
+            kept.append(goal)
+    if not starts:
+        raise GoalError(
+            f"none of the {len(goals)} goals can be reached from any state; give other goals or scenes"
+        )
+    return torch.cat(starts), torch.tensor(kept).repeat_interleave(episodes_per_goal)
+
+
+def _scene_range(scenes: SceneSet, state: int) -> tuple[int, int]:
+    scene = int(scenes.scene_id[state])
+    return int(scenes.offsets[scene]), int(scenes.offsets[scene + 1])
+
+
+def evaluate(
+    policy: TensorDictModuleBase,
+    scenes: SceneSet,
+    goals: Any = "all",
+    *,
+    trained: Tensor | None = None,
+    episodes_per_goal: int = 10,
+    max_steps: int = 500,
+    history: int = 4,
+    sample: bool = True,
+    unreachable: Unreachable = "skip",
+    seed: int = 0,
+    batch_size: int = 4096,
+    observe: Observe | None = None,
+    progress: Progress | None = None,
+) -> Episodes:
+    """Walks ``episodes_per_goal`` episodes to every goal and returns the table of them.
+
+    The draws come from ``seed`` alone and the caller's random state is left as it was, so an evaluation in
+    the middle of a training does not change the training. The policy is put in evaluation mode meanwhile
+    (means, not samples, of a variational agent's embeddings unless it asks for samples).
+
+    Args:
+        policy: reads ``state_id`` (n, H), ``goal_id`` (n,), ``scene_id`` (n,) and writes ``action`` (n,).
+        scenes: the world; on the policy's device.
+        goals: global state ids, or whatever :func:`vusfa.envs.goals.resolve_goals` takes.
+        trained: global ids of the goals that the policy was trained on; they are marked in the table.
+        episodes_per_goal: episodes for each goal, from starts drawn uniformly.
+        max_steps: actions allowed in an episode.
+        history: frames H in ``state_id``.
+        sample: draw actions from the policy; False takes the most probable one.
+        unreachable: ``"skip"`` or ``"fail"``, see :func:`episode_starts`.
+        seed: of starts and actions.
+        batch_size: episodes that walk at the same time.
+        observe: adds ``observation`` and ``goal_observation`` for a policy that reads these.
+        progress: called with (episodes finished, episodes in all) after every step.
+
+    Raises:
+        GoalError: a goal that does not exist, or none that can be reached.
+    """
+    goal_ids = resolve_goals(scenes, goals).cpu()
+    generator = torch.Generator().manual_seed(seed)
+    start, goal = episode_starts(
+        scenes, goal_ids, episodes_per_goal, unreachable=unreachable, generator=generator
+    )
+    devices = [scenes.successor.device] if scenes.successor.device.type == "cuda" else []
+    exploration = ExplorationType.RANDOM if sample else ExplorationType.DETERMINISTIC
+    with (
+        torch.random.fork_rng(devices),
+        _in_evaluation_mode(policy),
+        set_exploration_type(exploration),
+        frozen(policy),
+    ):
+        torch.manual_seed(seed)
+        success, length, collisions = walk(
+            policy,
+            scenes,
+            start,
+            goal,
+            max_steps=max_steps,
+            history=history,
+            batch_size=batch_size,
+            observe=observe,
+            progress=progress,
+        )
+    marked = torch.zeros(scenes.num_states, dtype=torch.bool)
+    if trained is not None:
+        marked[trained.cpu()] = True
+    return Episodes(
+        scene=scenes.scene_id.cpu()[goal],
+        goal=scenes.local_id(goal).cpu(),
+        start=scenes.local_id(start).cpu(),
+        success=success,
+        length=length,
+        shortest=scenes.distance(start, goal).cpu(),
+        collisions=collisions,
+        trained=marked[goal],
+        scene_names=tuple(scenes.names),
+        max_steps=max_steps,
+    )
+
+
+@torch.no_grad()
+def walk(
+    policy: TensorDictModuleBase,
+    scenes: SceneSet,
+    start: Tensor,
+    goal: Tensor,
+    *,
+    max_steps: int,
+    history: int,
+    batch_size: int = 4096,
+    observe: Observe | None = None,
+    progress: Progress | None = None,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Walks one episode from every start to its goal, in the exploration mode and from the random state in
+    force.
+
+    A policy with memory writes its next state under ``("next", key)``; it finds it again under ``key``, and
+    ``is_init`` (n, 1) tells it which rows begin.
+
+    Args:
+        policy, scenes, max_steps, history, batch_size, observe, progress: see :func:`evaluate`.
+        start: (n,) global state ids.
+        goal: (n,) global state ids.
+
+    Returns:
+        success (n,) bool, length (n,) int64 and collisions (n,) int64, on the CPU.
+    """
+    if max_steps < 1 or batch_size < 1:
+        raise ConfigError(f"max_steps is {max_steps} and batch_size {batch_size}; both must be 1 or more")
+    device = scenes.successor.device
+    start, goal = start.to(device), goal.to(device)
+    total = start.shape[0]
+    success = torch.zeros(total, dtype=torch.bool, device=device)
+    length = torch.full((total,), max_steps, dtype=torch.int64, device=device)
+    collisions = torch.zeros(total, dtype=torch.int64, device=device)
+    memory_keys = [key[1:] for key in policy.out_keys if isinstance(key, tuple) and key[0] == "next"]
+
+    rewards = Rewards.of()
+    begun = min(total, batch_size)
+    row = torch.arange(begun, device=device)  # which episode each row of the batch walks
+    steps = torch.zeros(begun, 1, dtype=torch.int64, device=device)
+    frames = start_history(start[row], history)
+    memory: dict[tuple[str, ...], Tensor] = {}
+    while row.numel():
+        batch = TensorDict(
+            {"state_id": frames, "goal_id": goal[row], "scene_id": scenes.scene_id[goal[row]]},
+            batch_size=row.shape,
+            device=device,
+        )
+        for key, value in memory.items():
+            batch.set(key, value)
+        batch.set("is_init", steps == 0)
+        if observe is not None:
+            batch = observe(batch)
+        batch = policy(batch)
+        end = step(
+            scenes.successor,
+            scenes.blocked,
+            rewards,
+            max_steps,
+            frames,
+            goal[row],
+            steps,
+            batch.get("action"),
+        )
+        frames, steps = end.state_id, end.step_count
+        success[row] = end.terminated.squeeze(-1)
+        length[row] = steps.squeeze(-1)
+        collisions.index_add_(0, row, end.collided.squeeze(-1).to(torch.int64))
+        memory = {key: batch.get(("next", *key)) for key in memory_keys}
+
+        walking = ~end.done.squeeze(-1)
+        if not bool(walking.all()):
+            new = torch.arange(begun, min(total, begun + batch_size - int(walking.sum())), device=device)
+            begun += new.shape[0]
+            row = torch.cat([row[walking], new])
+            steps = torch.cat([steps[walking], steps.new_zeros(new.shape[0], 1)])
+            frames = torch.cat([frames[walking], start_history(start[new], history)])
+            memory = {
+                key: torch.cat([value[walking], value.new_zeros(new.shape[0], *value.shape[1:])])
+                for key, value in memory.items()
+            }
+        if progress is not None:
+            progress(begun - row.shape[0], total)
+    return success.cpu(), length.cpu(), collisions.cpu()
+
+
+@contextmanager
+def _in_evaluation_mode(policy: nn.Module) -> Iterator[None]:
+    """Evaluation mode for every submodule, and afterwards each back in the mode it was in."""
+    modes = [(module, module.training) for module in policy.modules()]
+    policy.eval()
+    try:
+        yield
+    finally:
+        for module, mode in modes:
+            module.training = mode

@@ -1,0 +1,35 @@
+"""What a training needs around the objectives: collectors, loggers, a progress line, checkpoints.
+
+``recipes/train.py`` puts them together.
+"""
+
+from vusfa.training.checkpoint import load_checkpoint, save_checkpoint
+from vusfa.training.collectors import collecting, make_collector, make_env
+from vusfa.training.learning import descend, learning_rate, make_loss, make_optimiser, total_loss
+from vusfa.training.loggers import make_loggers
+from vusfa.training.metrics import EpisodeMeter, MeanMeter
+from vusfa.training.progress import ProgressLine
+from vusfa.training.session import Session, load_agent, rebuild_agent, scene_sources
+from vusfa.training.signals import StopOnSignal
+
+__all__ = [
+    "EpisodeMeter",
+    "MeanMeter",
+    "ProgressLine",
+    "Session",
+    "StopOnSignal",
+    "collecting",
+    "descend",
+    "learning_rate",
+    "load_agent",
+    "load_checkpoint",
+    "make_collector",
+    "make_env",
+    "make_loggers",
+    "make_loss",
+    "make_optimiser",
+    "rebuild_agent",
+    "save_checkpoint",
+    "scene_sources",
+    "total_loss",
+]

@@ -1,0 +1,212 @@
+"""Who walks while the agent learns: one process, several in step, or several each at its own pace.
+
+===============  ============================================================================================
+``single``       the environments step in this process. Runs repeat number for number, and resume so.
+``multi_sync``   worker processes walk with the same weights and wait for each other; a batch holds all rows.
+``multi_async``  worker processes never wait: a batch holds the rows of one worker, whoever is ready. Weights
+                 live in shared memory, so an update reaches walkers in mid-rollout. This field's A3C.
+===============  ============================================================================================
+
+All rows are dealt the same goals whichever way they are spread over processes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from functools import partial
+from typing import Any
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torchrl.collectors import BaseCollector, Collector, MultiAsyncCollector, MultiSyncCollector
+from torchrl.envs import EnvBase, TransformedEnv
+from torchrl.envs.transforms import Compose, Transform
+
+from vusfa.envs import TargetNavEnv
+from vusfa.errors import CheckpointError, ConfigError
+from vusfa.scenes import SceneSet
+from vusfa.training.signals import ignore_interrupts
+
+__all__ = [
+    "KINDS",
+    "collecting",
+    "collector_state",
+    "load_collector_state",
+    "make_collector",
+    "make_env",
+    "rows_per_worker",
+]
+
+KINDS = ("single", "multi_sync", "multi_async")
+
+MakeEnv = Callable[..., EnvBase]
+
+
+def make_env(scenes: SceneSet, transforms: Sequence[Transform] = (), **settings: Any) -> EnvBase:
+    """The task, with what the agent needs around it.
+
+    Args:
+        scenes: the world.
+        transforms: of the agent, such as an LSTM's first state; put around copies, so that each worker has
+            its own.
+        settings: of :class:`~vusfa.envs.TargetNavEnv`.
+
+    >>> make_env(SceneSet.bundled(["bathroom"]), batch_size=[5], history=1).batch_size
+    torch.Size([5])
+    """
+    env = TargetNavEnv(scenes, **settings)
+    if not transforms:
+        return env
+    return TransformedEnv(env, Compose(*(transform.clone() for transform in transforms)))
+
+
+def rows_per_worker(kind: str, num_envs: int, num_workers: int) -> int:
+    """How many environments each worker steps.
+
+    Raises:
+        ConfigError: unknown kind, or the environments cannot be shared out evenly.
+
+    >>> rows_per_worker("multi_sync", num_envs=40, num_workers=2)
+    20
+    """
+    if kind not in KINDS:
+        raise ConfigError(f"collector.kind is {kind!r}; it must be one of {', '.join(KINDS)}")
+    if num_envs < 1 or num_workers < 1:
+        raise ConfigError(
+            f"collector.num_envs is {num_envs} and collector.num_workers {num_workers}; both must be 1 or"
+            " more"
+        )
+    if kind == "single":
+        return num_envs
+    if num_envs % num_workers:
+        raise ConfigError(
+            f"collector.num_envs={num_envs} cannot be shared out among collector.num_workers={num_workers};"
+            " make it a multiple"
+        )
+    return num_envs // num_workers
+
+
+def make_collector(
+    kind: str,
+    make_env: MakeEnv,
+    policy: TensorDictModuleBase,
+    *,
+    num_envs: int,
+    rollout: int,
+    num_workers: int = 1,
+    seed: int = 0,
+    autocast: bool = False,
+) -> BaseCollector:
+    """A collector that never ends; whoever reads it counts the frames.
+
+    Args:
+        kind: ``"single"``, ``"multi_sync"`` or ``"multi_async"``.
+        make_env: called with ``batch_size``, ``first_goal`` and ``seed``, in the worker; picklable.
+        policy: writes ``action``; workers get its weights through shared memory.
+        num_envs: environments in all.
+        rollout: steps T of each environment in a batch; ``single`` and ``multi_sync`` give batches of
+            num_envs x T frames, ``multi_async`` of num_envs / num_workers x T.
+        num_workers: processes, of the two kinds that have some.
+        seed: of the environments and the workers' draws of actions.
+        autocast: workers compute in bfloat16 where that is safe; in this process the caller decides, by
+            collecting within :class:`torch.autocast`.
+
+    Raises:
+        ConfigError: see :func:`rows_per_worker`.
+    """
+    rows = rows_per_worker(kind, num_envs, num_workers)
+    if rollout < 1:
+        raise ConfigError(f"collector.rollout is {rollout}; it must be 1 or more")
+    shared: dict[str, Any] = {
+        "total_frames": -1,
+        "auto_register_policy_transforms": False,
+        "use_buffers": True,
+    }
+    if kind == "single":
+        env = make_env(batch_size=[rows], first_goal=0, seed=seed)
+        return Collector(env, policy, frames_per_batch=rows * rollout, track_traj_ids=False, **shared)
+    makers = [
+        partial(make_env, batch_size=[rows], first_goal=worker * rows, seed=seed + worker)
+        for worker in range(num_workers)
+    ]
+    threads = torch.get_num_threads()  # without num_threads= the collector takes some of this process's away
+    shared |= {
+        "num_threads": threads,
+        "num_sub_threads": 1,
+        "init_fn": partial(_begin_worker, autocast),
+    }
+    if kind == "multi_sync":
+        collector: BaseCollector = MultiSyncCollector(
+            makers, policy, frames_per_batch=num_envs * rollout, cat_results=0, **shared
+        )
+    else:
+        collector = MultiAsyncCollector(makers, policy, frames_per_batch=rows * rollout, **shared)
+    collector.set_seed(seed)
+    return collector
+
+
+def _begin_worker(autocast: bool) -> None:
+    """First thing in every worker process."""
+    ignore_interrupts()
+    if autocast:
+        torch.set_autocast_dtype("cpu", torch.bfloat16)
+        torch.set_autocast_enabled("cpu", True)
+        # The cache would keep weights converted before an update for as long as the worker lives.
+        torch.set_autocast_cache_enabled(False)
+
+
+@contextmanager
+def collecting(collector: BaseCollector) -> Iterator[Iterator[TensorDictBase]]:
+    """The collector's batches; on the way out, however one leaves, its processes end.
+
+    Closing a collector changes this process's number of threads; that is put right, too.
+    """
+    threads = torch.get_num_threads()
+    try:
+        yield iter(collector)
+    finally:
+        collector.shutdown()
+        torch.set_num_threads(threads)
+
+
+def collector_state(collector: BaseCollector) -> dict[str, Any]:
+    """Where the environments stand, as tensors and plain data.
+
+    Only a single collector can say; one with workers has nothing to give, and begins new episodes when it
+    resumes.
+    """
+    if not isinstance(collector, Collector):
+        return {}
+    return {
+        "env": dict(collector.env.state_dict()),
+        "generator": _base(collector.env).get_rng_state(),
+        "batch_size": list(collector._carrier.batch_size),
+        "carrier": collector._carrier.clone().to_dict(),
+    }
+
+
+def load_collector_state(collector: BaseCollector, state: dict[str, Any]) -> None:
+    """Put the environments back to where :func:`collector_state` found them, as far as the kind of collector
+    can.
+
+    Raises:
+        CheckpointError: the state is of environments in another number.
+    """
+    if not isinstance(collector, Collector) or not state:
+        return
+    batch_size = list(collector._carrier.batch_size)
+    if state["batch_size"] != batch_size:
+        raise CheckpointError(
+            f"the checkpoint holds {state['batch_size']} environments, the collector {batch_size};"
+            " leave collector.num_envs as it was"
+        )
+    collector.env.load_state_dict(state["env"])
+    _base(collector.env).set_rng_state(state["generator"])
+    # The collector has no public way to be put in mid-episode. What it goes on from is its carrier.
+    collector._carrier = TensorDict(state["carrier"], batch_size=batch_size, device=collector._carrier.device)
+
+
+def _base(env: EnvBase) -> TargetNavEnv:
+    return env.base_env if isinstance(env, TransformedEnv) else env

@@ -1,0 +1,187 @@
+"""Hydra around a recipe: settings in, one line on whatever is wrong with them, exit codes out.
+
+The one part of this package that needs Hydra (extra ``recipes``). A recipe is a function of its settings::
+
+    def main(cfg, overrides):
+        ...
+        return 0
+
+    if __name__ == "__main__":
+        launch(main, Path(__file__).parent / "conf", "train")
+"""
+
+from __future__ import annotations
+
+import difflib
+import os
+import re
+import sys
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import hydra
+from hydra.core.global_hydra import GlobalHydra
+from hydra.core.hydra_config import HydraConfig
+from hydra.errors import HydraException, MissingConfigException, OverrideParseException
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from vusfa.errors import ConfigError, VusfaError
+from vusfa.modules.presets import resolve_config
+from vusfa.training.checkpoint import load_checkpoint
+from vusfa.training.loggers import flat
+
+__all__ = ["check_types", "compose", "launch", "with_saved_overrides"]
+
+BAD_INPUT = 2
+INTERRUPTED = 130
+
+
+def launch(job: Callable[[DictConfig, list[str]], int], folder: Path, name: str) -> None:
+    """Compose the configuration from the command line, run the job with it, exit with the code that it
+    returns.
+
+    What a user got wrong (:class:`~vusfa.errors.VusfaError`, or an error of Hydra's) ends in one line on
+    standard error and code 2. An error of ours keeps its traceback.
+
+    Args:
+        job: gets the settings, resolved and with their types checked, and the command line's overrides.
+        folder: of the configuration files.
+        name: the primary one.
+    """
+    # Hydra then raises its errors instead of printing them; nothing else changes.
+    os.environ["HYDRA_FULL_ERROR"] = "1"
+    codes: list[int] = []
+
+    def guarded(cfg: DictConfig) -> None:
+        # Errors are reported in here: one that passed through Hydra would get lines of Hydra's around it.
+        codes.append(
+            _report(lambda: job(_settled(cfg, folder, name), list(HydraConfig.get().overrides.task)))
+        )
+
+    def run() -> int:
+        sys.argv[1:] = with_saved_overrides(sys.argv[1:])
+        hydra.main(version_base="1.3", config_path=str(folder.resolve()), config_name=name)(guarded)()
+        return max(codes, default=0)  # a sweep has several; --help none
+
+    try:
+        code = _report(run)
+    except (HydraException, OmegaConfBaseException) as error:
+        code = _complain(explain(error, folder, name))
+    sys.exit(code)
+
+
+def compose(folder: Path, name: str, overrides: Sequence[str] = ()) -> DictConfig:
+    """The configuration as the command line would make it, without running anything.
+
+    Args:
+        folder: of the configuration files.
+        name: the primary one.
+        overrides: what would be on the command line.
+    """
+    if GlobalHydra.instance().is_initialized():  # within a job
+        return hydra.compose(name, list(overrides))
+    with hydra.initialize_config_dir(str(folder.resolve()), version_base="1.3"):
+        return hydra.compose(name, list(overrides))
+
+
+def with_saved_overrides(arguments: Sequence[str]) -> list[str]:
+    """The command line of a resumed run: that of the run it resumes, then what was given now.
+
+    ``resume=RUN/checkpoint.pt`` alone continues with the same settings, in the same folder. What is given now
+    wins.
+
+    Raises:
+        CheckpointError: the checkpoint cannot be read.
+
+    >>> with_saved_overrides(["seed=3"])
+    ['seed=3']
+    """
+    paths = [argument.partition("=")[2] for argument in arguments if argument.startswith("resume=")]
+    if not paths or paths[-1] in ("", "null"):
+        return list(arguments)
+    given = {argument.partition("=")[0].lstrip("+~") for argument in arguments}
+    saved = load_checkpoint(paths[-1]).get("overrides", [])
+    kept = [override for override in saved if override.partition("=")[0].lstrip("+~") not in given]
+    folder = [] if "folder" in given else [f"folder='{Path(paths[-1]).resolve().parent}'"]
+    return [*kept, *folder, *arguments]
+
+
+def check_types(cfg: Mapping[str, Any], defaults: Mapping[str, Any]) -> None:
+    """Refuse a word where the default is a number, a fraction where it is a whole number, and so on.
+
+    Raises:
+        ConfigError: naming the setting, its value, and a value that would do.
+
+    >>> check_types({"optim": {"lr": "fast"}}, {"optim": {"lr": 0.1}})
+    Traceback (most recent call last):
+    ...
+    vusfa.errors.ConfigError: optim.lr is 'fast'; it must be a number, such as 0.1
+    """
+    expected = flat(defaults)
+    for key, value in flat(cfg).items():
+        default = expected.get(key)
+        for kind, accepted, words in (
+            (bool, (bool,), "true or false"),
+            (int, (int,), f"a whole number, such as {default}"),
+            (float, (int, float), f"a number, such as {default}"),
+        ):
+            if type(default) is kind and type(value) not in accepted:
+                raise ConfigError(f"{key} is {value!r}; it must be {words}")
+
+
+def explain(error: Exception, folder: Path, name: str) -> str:
+    """One line for an error of Hydra's: what is wrong, and what would be right."""
+    text = " ".join(str(error).split())
+    if isinstance(error, OverrideParseException):
+        reason = text.split(" See https")[0]
+        return f"cannot read {error.override!r} ({reason}); settings are written setting=value"
+    if isinstance(error, MissingConfigException) and "Available options" in str(error):
+        wanted = (error.missing_cfg_file or "").rpartition("/")
+        options = sorted(option.strip() for option in error.options or ())
+        return f"{wanted[0]}={wanted[2]}: there is no such choice{_near(wanted[2], options)}"
+    unknown = re.match(r"Could not override '([^']+)'", text)
+    if unknown:
+        GlobalHydra.instance().clear()
+        known = compose(folder, name)
+        groups = [entry.name for entry in folder.iterdir() if entry.is_dir()]
+        keys = [*flat(OmegaConf.to_container(known)), *groups]  # type: ignore[arg-type]
+        return f"no setting is called {unknown[1]!r}{_near(unknown[1], keys)}"
+    return text
+
+
+def _near(word: str, choices: Iterable[str]) -> str:
+    choices = list(choices)
+    near = difflib.get_close_matches(word, choices, n=1, cutoff=0.5)
+    if near:
+        return f"; did you mean {near[0]!r}?"
+    return f"; there are {', '.join(choices)}" if len(choices) <= 12 else "; --help lists all settings"
+
+
+def _settled(cfg: DictConfig, folder: Path, name: str) -> DictConfig:
+    """Interpolations resolved, types checked."""
+    model = OmegaConf.select(cfg, "agent.model")
+    if model is not None:
+        resolve_config(model)  # before anything is looked up by the model's name
+    OmegaConf.resolve(cfg)
+    choices = HydraConfig.get().runtime.choices
+    groups = [f"{group}={choice}" for group, choice in choices.items() if not group.startswith("hydra/")]
+    defaults = compose(folder, name, [*groups, *([f"agent.model={model}"] if model is not None else [])])
+    OmegaConf.resolve(defaults)
+    check_types(OmegaConf.to_container(cfg), OmegaConf.to_container(defaults))  # type: ignore[arg-type]
+    return cfg
+
+
+def _report(job: Callable[[], int]) -> int:
+    try:
+        return job()
+    except VusfaError as error:
+        return _complain(str(error))
+    except KeyboardInterrupt:
+        return _complain("interrupted before the first update; nothing was written", INTERRUPTED)
+
+
+def _complain(message: str, code: int = BAD_INPUT) -> int:
+    print(f"error: {message}", file=sys.stderr)
+    return code

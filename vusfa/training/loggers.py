@@ -1,0 +1,294 @@
+"""Where numbers go: a CSV file, TensorBoard, Weights & Biases. Each of them a few lines behind one
+protocol."""
+
+from __future__ import annotations
+
+import csv
+import math
+import os
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, Protocol
+
+from vusfa.errors import ConfigError
+from vusfa.evaluation.files import write_csv, write_json
+
+__all__ = ["CSVLogger", "Logger", "Loggers", "TensorBoardLogger", "WandbLogger", "flat", "make_loggers"]
+
+
+class Logger(Protocol):
+    """What a training tells of itself."""
+
+    def log_metrics(self, metrics: Mapping[str, float], frames: int) -> None:
+        """Numbers after so many frames; NaN stands for a rate over nothing."""
+
+    def log_checkpoint(self, path: Path, frames: int) -> None:
+        """A checkpoint has been written."""
+
+    def log_table(self, name: str, rows: Sequence[Mapping[str, Any]], frames: int) -> None:
+        """A table of results, such as an evaluation's summary."""
+
+    def close(self, exit_code: int = 0) -> None:
+        """Nothing more comes."""
+
+
+class CSVLogger:
+    """``metrics.csv`` with one row a call, ``NAME.csv`` for every table, ``config.json``; needs nothing
+    installed.
+
+    Rows are appended as they come. Where the file has later rows than ``resume_frames`` (the run went on
+    after its last checkpoint, then died), these are taken out first: a resumed run's file is that of a run
+    without interruption.
+
+    Args:
+        folder: where to.
+        config: written to ``config.json``.
+        resume_frames: frames of the checkpoint that the run continues from; None for a new run.
+
+    >>> import tempfile
+    >>> folder = tempfile.mkdtemp()
+    >>> log = CSVLogger(folder, {"seed": 1})
+    >>> log.log_metrics({"loss": 0.5, "success": math.nan}, frames=100)
+    >>> log.close()
+    >>> (Path(folder) / "metrics.csv").read_text()
+    'frames,loss,success\\n100,0.5,\\n'
+    """
+
+    def __init__(
+        self, folder: str | Path, config: Mapping[str, Any], resume_frames: int | None = None
+    ) -> None:
+        self.folder = Path(folder)
+        self._file = self.folder / "metrics.csv"
+        self._columns: list[str] | None = None
+        write_json(self.folder / "config.json", config)
+        if resume_frames is None:
+            self._file.unlink(missing_ok=True)
+        elif self._file.is_file():
+            with open(self._file, newline="", encoding="utf-8") as file:
+                reader = csv.DictReader(file)
+                kept = [row for row in reader if _frames(row) <= resume_frames]
+                self._columns = list(reader.fieldnames or ()) or None
+            write_csv(self._file, kept, self._columns)
+
+    def log_metrics(self, metrics: Mapping[str, float], frames: int) -> None:
+        """Append one row; the first one decides on the columns."""
+        row = {"frames": frames, **metrics}
+        new = self._columns is None
+        self._columns = self._columns or list(row)
+        if set(row) - set(self._columns):
+            raise ValueError(f"metrics.csv has no column {sorted(set(row) - set(self._columns))[0]!r}")
+        with open(self._file, "a", newline="", encoding="utf-8") as file:
+            writer = csv.DictWriter(file, self._columns, lineterminator="\n")
+            if new:
+                writer.writeheader()
+            writer.writerow({k: "" if isinstance(v, float) and math.isnan(v) else v for k, v in row.items()})
+
+    def log_checkpoint(self, path: Path, frames: int) -> None:
+        """The file itself is the record."""
+
+    def log_table(self, name: str, rows: Sequence[Mapping[str, Any]], frames: int) -> None:
+        """Write ``NAME.csv``."""
+        write_csv(self.folder / f"{name}.csv", rows)
+
+    def close(self, exit_code: int = 0) -> None:
+        """Nothing is open."""
+
+
+class TensorBoardLogger:
+    """Scalars, the configuration and the tables (as text) in a TensorBoard run; needs ``tensorboard``.
+
+    Args:
+        folder: the run's folder.
+        config: shown under "text".
+    """
+
+    def __init__(self, folder: str | Path, config: Mapping[str, Any]) -> None:
+        from torch.utils.tensorboard import SummaryWriter
+
+        self._writer = SummaryWriter(str(folder))
+        lines = [{"setting": key, "value": value} for key, value in flat(config).items()]
+        self._writer.add_text("config", _markdown(lines))
+
+    def log_metrics(self, metrics: Mapping[str, float], frames: int) -> None:
+        """Every number but NaN, which TensorBoard would draw."""
+        for key, value in metrics.items():
+            if not math.isnan(value):
+                self._writer.add_scalar(key, value, frames)
+
+    def log_checkpoint(self, path: Path, frames: int) -> None:
+        """Its path, as text."""
+        self._writer.add_text("checkpoint", str(path), frames)
+
+    def log_table(self, name: str, rows: Sequence[Mapping[str, Any]], frames: int) -> None:
+        """As text."""
+        self._writer.add_text(name, _markdown(rows), frames)
+
+    def close(self, exit_code: int = 0) -> None:
+        """Write what is left and close the file."""
+        self._writer.close()
+
+
+class WandbLogger:
+    """A run at Weights & Biases: configuration, metrics, checkpoints as artifacts, tables; needs ``wandb``.
+
+    Without a network, ``mode="offline"`` keeps everything in ``folder`` (``wandb sync`` sends it later), or
+    ``mode="disabled"`` does nothing.
+
+    Args:
+        folder: where wandb keeps its files.
+        config: the run's configuration.
+        run_id: the run's id; one that exists already is continued.
+        project: wandb's project.
+        mode: ``"online"``, ``"offline"`` or ``"disabled"``.
+        name: the run's name; wandb makes one up without.
+    """
+
+    def __init__(
+        self,
+        folder: str | Path,
+        config: Mapping[str, Any],
+        run_id: str,
+        project: str = "vusfa",
+        mode: str = "online",
+        name: str | None = None,
+    ) -> None:
+        import wandb
+
+        Path(folder).mkdir(parents=True, exist_ok=True)
+        # Artifacts wait in a staging folder to be sent. By default that is in HOME; keep a run's files
+        # together.
+        os.environ.setdefault("WANDB_DATA_DIR", str(Path(folder).resolve()))
+        self._wandb = wandb
+        self.run = wandb.init(
+            dir=str(folder),
+            config=dict(config),
+            project=project,
+            mode=mode,  # type: ignore[arg-type]
+            name=name,
+            id=run_id,
+            resume="allow",
+            settings=wandb.Settings(silent=True),
+        )
+        self.run.define_metric("*", step_metric="frames")
+
+    def log_metrics(self, metrics: Mapping[str, float], frames: int) -> None:
+        """Every number but NaN."""
+        self.run.log({"frames": frames, **{k: v for k, v in metrics.items() if not math.isnan(v)}})
+
+    def log_checkpoint(self, path: Path, frames: int) -> None:
+        """The file as a version of the artifact ``checkpoint-RUN``, of type "model"."""
+        artifact = self._wandb.Artifact(
+            f"checkpoint-{self.run.id}", type="model", metadata={"frames": frames}
+        )
+        artifact.add_file(str(path))
+        self.run.log_artifact(artifact)
+
+    def log_table(self, name: str, rows: Sequence[Mapping[str, Any]], frames: int) -> None:
+        """A wandb table."""
+        columns: list[Any] = list(rows[0]) if rows else []
+        data = [[None if _is_nan(row[key]) else row[key] for key in columns] for row in rows]
+        self.run.log({"frames": frames, name: self._wandb.Table(columns=columns, data=data)})
+
+    def close(self, exit_code: int = 0) -> None:
+        """End the run and wait until its files are written or sent."""
+        self.run.finish(exit_code=exit_code)
+
+
+class Loggers:
+    """Several loggers as one; whatever happens is told to each."""
+
+    def __init__(self, loggers: Sequence[Logger]) -> None:
+        self.loggers = tuple(loggers)
+
+    def log_metrics(self, metrics: Mapping[str, float], frames: int) -> None:
+        """See :class:`Logger`."""
+        for logger in self.loggers:
+            logger.log_metrics(metrics, frames)
+
+    def log_checkpoint(self, path: Path, frames: int) -> None:
+        """See :class:`Logger`."""
+        for logger in self.loggers:
+            logger.log_checkpoint(path, frames)
+
+    def log_table(self, name: str, rows: Sequence[Mapping[str, Any]], frames: int) -> None:
+        """See :class:`Logger`."""
+        for logger in self.loggers:
+            logger.log_table(name, rows, frames)
+
+    def close(self, exit_code: int = 0) -> None:
+        """See :class:`Logger`."""
+        for logger in self.loggers:
+            logger.close(exit_code)
+
+
+def make_loggers(
+    kinds: Sequence[str],
+    folder: str | Path,
+    config: Mapping[str, Any],
+    *,
+    run_id: str,
+    resume_frames: int | None = None,
+    project: str = "vusfa",
+    mode: str = "online",
+    name: str | None = None,
+) -> Loggers:
+    """Loggers by name: any of ``csv``, ``tensorboard`` and ``wandb``.
+
+    Args:
+        kinds: which ones.
+        folder: where their files go.
+        config: the run's configuration, plain data.
+        run_id: the run's id, the same when it is resumed.
+        resume_frames: frames of the checkpoint that the run continues from; None for a new run.
+        project, mode, name: of :class:`WandbLogger`.
+
+    Raises:
+        ConfigError: unknown kind, or its library is not installed.
+    """
+    makers: dict[str, Callable[[], Logger]] = {
+        "csv": lambda: CSVLogger(folder, config, resume_frames),
+        "tensorboard": lambda: TensorBoardLogger(Path(folder) / "tensorboard", config),
+        "wandb": lambda: WandbLogger(folder, config, run_id, project, mode, name),
+    }
+    for kind in kinds:
+        if kind not in makers:
+            raise ConfigError(f"logger.kinds holds {kind!r}; it may hold {', '.join(makers)}")
+    loggers = []
+    for kind in kinds:
+        try:
+            loggers.append(makers[kind]())
+        except ImportError as error:
+            raise ConfigError(f"logger {kind} needs {error.name}; pip install 'vusfa[recipes]'") from error
+    return Loggers(loggers)
+
+
+def flat(config: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Nested settings as one level with dotted names.
+
+    >>> flat({"optim": {"lr": 0.1}, "seed": 1})
+    {'optim.lr': 0.1, 'seed': 1}
+    """
+    result: dict[str, Any] = {}
+    for key, value in config.items():
+        if isinstance(value, Mapping):
+            result |= flat(value, f"{prefix}{key}.")
+        else:
+            result[f"{prefix}{key}"] = value
+    return result
+
+
+def _markdown(rows: Sequence[Mapping[str, Any]]) -> str:
+    if not rows:
+        return ""
+    lines = [list(rows[0]), ["---"] * len(rows[0]), *([f"{value}" for value in row.values()] for row in rows)]
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+
+
+def _frames(row: Mapping[str, str | None]) -> int:
+    """Frames of a row of ``metrics.csv``; a row that was cut off in the writing counts as later than all."""
+    complete = None not in row.values()
+    return int(row["frames"] or 0) if complete else 1 << 62
+
+
+def _is_nan(value: Any) -> bool:
+    return isinstance(value, float) and math.isnan(value)

@@ -1,0 +1,153 @@
+"""Counts, while training, how the episodes end: per goal, per scene and over all.
+
+One :meth:`EpisodeMeter.update` an update: a few ``index_add`` over the episodes that ended in the batch,
+nothing per goal in Python. The sums turn into rates only when someone logs them.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from vusfa.scenes import SceneSet
+
+__all__ = ["EpisodeMeter", "MeanMeter"]
+
+# The table of sums has five rows: episodes, successes, length, length of the successes, their shortest paths.
+_EPISODES = 0
+
+
+class EpisodeMeter:
+    """Sums over the episodes that ended since the last :meth:`flush`.
+
+    Args:
+        scenes: the world.
+        goals: (G,) global ids of the goals trained on.
+
+    >>> scenes = SceneSet.bundled(["bathroom"])
+    >>> meter = EpisodeMeter(scenes, torch.tensor([3, 40]))
+    >>> sorted(meter.flush())[:3]
+    ['collisions', 'episodes', 'goal/bathroom/3/length_ratio']
+    """
+
+    def __init__(self, scenes: SceneSet, goals: Tensor) -> None:
+        goals = goals.cpu().unique()
+        self.goals = goals
+        self._column = torch.full((scenes.num_states,), -1)
+        self._column[goals] = torch.arange(len(goals))
+        self._scene = scenes.scene_id.cpu()[goals]
+        self._scene_names = scenes.names
+        local = scenes.local_id(goals.to(scenes.scene_id.device)).tolist()
+        self._names = [f"{scenes.names[s]}/{g}" for s, g in zip(self._scene.tolist(), local, strict=True)]
+        self._clear()
+
+    def _clear(self) -> None:
+        self._sums = torch.zeros(5, len(self.goals), dtype=torch.float64)
+        self._frames = 0
+        self._collisions = torch.zeros((), dtype=torch.int64)
+
+    def update(self, batch: TensorDictBase) -> None:
+        """Takes in a collector's batch, of any shape."""
+        after = batch.get("next")
+        self._frames += batch.numel()
+        self._collisions += after.get("collided").sum().cpu()
+        done = after.get("done").squeeze(-1)
+        if not bool(done.any()):
+            return
+        column = self._column[after.get("goal_id")[done].cpu()]
+        success = after.get("terminated").squeeze(-1)[done].cpu().to(torch.float64)
+        length = after.get("step_count").squeeze(-1)[done].cpu().to(torch.float64)
+        shortest = after.get("shortest_path").squeeze(-1)[done].cpu().to(torch.float64)
+        rows = [torch.ones_like(length), success, length, success * length, success * shortest]
+        self._sums.index_add_(1, column, torch.stack(rows))
+
+    def flush(self) -> dict[str, float]:
+        """The rates since the last call, and starts over.
+
+        Returns:
+            ``episodes`` and ``collisions`` (a step); ``success`` (share of the episodes that ended at their
+            goal), ``length`` (of an episode, in actions) and ``length_ratio`` (mean length of the successful
+            episodes over the mean of their shortest paths) over all goals; the same under ``scene/NAME/``
+            and, without the length, under ``goal/NAME/STATE/``. A rate over no episode is NaN. The keys are
+            always the same.
+        """
+        sums = self._sums
+        collisions = self._collisions.item() / self._frames if self._frames else math.nan
+        result = {
+            "episodes": sums[_EPISODES].sum().item(),
+            "collisions": collisions,
+            **_rates(sums.sum(1).tolist()),
+        }
+        for index, name in enumerate(self._scene_names):
+            chosen = self._scene == index
+            if bool(chosen.any()):
+                rates = _rates(sums[:, chosen].sum(1).tolist())
+                result |= {f"scene/{name}/{key}": value for key, value in rates.items()}
+        for name, column in zip(self._names, sums.T.tolist(), strict=True):
+            rates = _rates(column)
+            result |= {f"goal/{name}/{key}": rates[key] for key in ("success", "length_ratio")}
+        self._clear()
+        return result
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """The sums since the last :meth:`flush`."""
+        return {"sums": self._sums, "frames": torch.tensor(self._frames), "collisions": self._collisions}
+
+    def load_state_dict(self, state: Mapping[str, Tensor]) -> None:
+        """Go on from what :meth:`state_dict` gave, for the same goals."""
+        self._sums = state["sums"].cpu()
+        self._frames = int(state["frames"])
+        self._collisions = state["collisions"].cpu()
+
+
+class MeanMeter:
+    """Means of numbers that every update gives, such as the terms of a loss, since the last :meth:`flush`.
+
+    >>> meter = MeanMeter()
+    >>> meter.update({"kl": torch.tensor(0.5)})
+    >>> meter.update({"kl": torch.tensor(0.25)})
+    >>> meter.flush(), meter.flush()
+    ({'kl': 0.375}, {'kl': nan})
+    """
+
+    def __init__(self) -> None:
+        self._names: list[str] = []
+        self._sum: Tensor | None = None
+        self._count = 0
+
+    def update(self, values: Mapping[str, Tensor]) -> None:
+        """Takes in one number for every name, the same names each time; stays on their device."""
+        self._names = self._names or list(values)
+        row = torch.stack([values[name].detach().to(torch.float64) for name in self._names])
+        self._sum = row if self._sum is None else self._sum + row
+        self._count += 1
+
+    def flush(self) -> dict[str, float]:
+        """The means since the last call, NaN without an update in between, and starts over."""
+        if self._sum is None or not self._count:
+            return dict.fromkeys(self._names, math.nan)
+        result = dict(zip(self._names, (self._sum / self._count).tolist(), strict=True))
+        self._sum, self._count = None, 0
+        return result
+
+    def state_dict(self) -> dict[str, Any]:
+        """The sums since the last :meth:`flush`."""
+        return {"names": self._names, "sum": self._sum, "count": self._count}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Go on from what :meth:`state_dict` gave."""
+        self._names, self._sum, self._count = list(state["names"]), state["sum"], state["count"]
+
+
+def _rates(sums: Sequence[float]) -> dict[str, float]:
+    episodes, successes, length, success_length, success_shortest = sums
+    return {
+        "success": successes / episodes if episodes else math.nan,
+        "length": length / episodes if episodes else math.nan,
+        "length_ratio": success_length / success_shortest if success_shortest else math.nan,
+    }

@@ -1,0 +1,204 @@
+"""A training as one thing that can be saved, and taken up where it was."""
+
+from __future__ import annotations
+
+import secrets
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+from torchrl.collectors import BaseCollector
+from torchrl.objectives import LossModule
+
+from vusfa.errors import CheckpointError
+from vusfa.modules import Agent, make_agent
+from vusfa.scenes import SceneSet, bundled_names
+from vusfa.training.checkpoint import (
+    check_scenes,
+    check_setting,
+    load_checkpoint,
+    random_state,
+    restore_random_state,
+    save_checkpoint,
+)
+from vusfa.training.collectors import collector_state, load_collector_state
+from vusfa.training.learning import loss_state
+from vusfa.training.metrics import EpisodeMeter, MeanMeter
+
+__all__ = ["Session", "load_agent", "rebuild_agent", "scene_sources"]
+
+# entries of Agent.config that describe the scenes, not the agent
+_OF_SCENES = ("scenes", "fingerprint", "num_actions")
+
+
+@dataclass
+class Session:
+    """Everything that changes while an agent learns, and how far it has come.
+
+    Args:
+        scenes: the world.
+        goals: (G,) global ids of the goals trained on.
+        agent, loss, optimiser, collector: the parts; the collector not yet iterated.
+        settings: what the checkpoint shall say of how all this was made: plain data under ``config``,
+            ``overrides`` and ``sources`` (what was given as scenes).
+
+    Attributes:
+        frames: frames trained on.
+        updates: steps of the optimiser.
+        seconds: time spent training, this run and those that it continues.
+        episodes: how the episodes since the last line of the log ended.
+        terms: means of the loss's terms since then.
+        run_id: the same for all loggers and for all resumptions.
+    """
+
+    scenes: SceneSet
+    goals: Tensor
+    agent: Agent
+    loss: LossModule
+    optimiser: torch.optim.Optimizer
+    collector: BaseCollector
+    settings: Mapping[str, Any]
+    frames: int = 0
+    updates: int = 0
+    seconds: float = 0.0
+    run_id: str = field(default_factory=lambda: secrets.token_hex(4))
+
+    def __post_init__(self) -> None:
+        self.episodes = EpisodeMeter(self.scenes, self.goals)
+        self.terms = MeanMeter()
+
+    def count(self, batch: TensorDictBase, terms: Mapping[str, Tensor], seconds: float) -> None:
+        """One update has been made.
+
+        Args:
+            batch: the collector's.
+            terms: numbers to log the means of, the same names each time.
+            seconds: that it took.
+        """
+        self.frames += batch.numel()
+        self.updates += 1
+        self.seconds += seconds
+        self.episodes.update(batch)
+        self.terms.update(terms)
+
+    def metrics(self) -> dict[str, float]:
+        """A line of the log: what the meters hold, which begin anew, and how far the training has come."""
+        head = {
+            "updates": float(self.updates),
+            "seconds": self.seconds,
+            "lr": self.optimiser.param_groups[0]["lr"],
+        }
+        return head | self.episodes.flush() | self.terms.flush()
+
+    def save(self, path: str | Path) -> Path:
+        """Write a checkpoint, atomically; see :mod:`vusfa.training.checkpoint`."""
+        return save_checkpoint(
+            path,
+            {
+                "frames": self.frames,
+                "updates": self.updates,
+                "seconds": self.seconds,
+                "run_id": self.run_id,
+                "scenes": {
+                    "sources": self.settings["sources"],
+                    "names": list(self.scenes.names),
+                    "fingerprint": self.scenes.fingerprint,
+                },
+                "goals": self.goals.cpu(),
+                "config": self.settings["config"],
+                "overrides": self.settings["overrides"],
+                "agent_config": self.agent.config,
+                "agent": self.agent.state_dict(),
+                "loss": loss_state(self.loss),
+                "optimiser": self.optimiser.state_dict(),
+                "collector": collector_state(self.collector),
+                "meter": {"episodes": self.episodes.state_dict(), "terms": self.terms.state_dict()},
+                "rng": random_state(),
+            },
+        )
+
+    def resume(self, path: str | Path) -> None:
+        """Go on from a checkpoint. With a single collector what follows is what would have followed, number
+        for number.
+
+        Raises:
+            CheckpointError: the file is damaged, or of another model, other scenes or other goals.
+        """
+        state = load_checkpoint(path, next(self.agent.parameters()).device)
+        check_scenes(path, state["scenes"], self.scenes)
+        for key, value in self.agent.config.items():
+            if key not in _OF_SCENES:
+                check_setting(path, f"agent.{key}", state["agent_config"].get(key), value)
+        check_setting(path, "env.goals", state["goals"].tolist(), self.goals.tolist())
+        _load_weights(self.agent, state, path)
+        missing, unexpected = self.loss.load_state_dict(state["loss"], strict=False)
+        wrong = [*unexpected, *(key for key in missing if key in loss_state(self.loss))]
+        if wrong:
+            raise CheckpointError(f"{path}: its loss and this one differ in {wrong[0]!r}; start a new run")
+        self.optimiser.load_state_dict(state["optimiser"])
+        self.episodes.load_state_dict(state["meter"]["episodes"])
+        self.terms.load_state_dict(state["meter"]["terms"])
+        for name in ("frames", "updates", "seconds", "run_id"):
+            setattr(self, name, state[name])
+        load_collector_state(self.collector, state["collector"])
+        restore_random_state(state["rng"])  # last: what came before may have drawn
+
+
+def scene_sources(scenes: str | Sequence[str]) -> list[str]:
+    """What was given as scenes, in a form that still works from another folder.
+
+    >>> scene_sources("kitchen")
+    ['kitchen']
+    """
+    given = [scenes] if isinstance(scenes, str) else list(scenes)
+    return [name if name in bundled_names() else str(Path(name).resolve()) for name in given]
+
+
+def rebuild_agent(config: Mapping[str, Any], scenes: SceneSet) -> Agent:
+    """An untrained agent of the shape that :attr:`vusfa.modules.Agent.config` describes.
+
+    >>> scenes = SceneSet.bundled(["bathroom"])
+    >>> agent = make_agent("gvf", scenes=scenes, hidden_size=8, embedding_size=8)
+    >>> rebuild_agent(agent.config, scenes).config == agent.config
+    True
+    """
+    return make_agent(scenes=scenes, **{k: v for k, v in config.items() if k not in _OF_SCENES})
+
+
+def load_agent(
+    path: str | Path, scenes: SceneSet | None = None, device: torch.device | str = "cpu"
+) -> tuple[Agent, SceneSet, dict[str, Any]]:
+    """The agent of a checkpoint, in evaluation mode, with its scenes.
+
+    Args:
+        path: the checkpoint.
+        scenes: the scenes that it was trained in; opened as they were then, when not given.
+        device: where the agent and the scenes' tables go.
+
+    Returns:
+        agent, scenes and the checkpoint's content.
+
+    Raises:
+        CheckpointError: the file is damaged, or of other scenes.
+        SceneError: its scenes are not where they were.
+    """
+    state = load_checkpoint(path, device)
+    scenes = (SceneSet.open(state["scenes"]["sources"]) if scenes is None else scenes).to(device)
+    check_scenes(path, state["scenes"], scenes)
+    agent = rebuild_agent(state["agent_config"], scenes).to(device)
+    _load_weights(agent, state, path)
+    return agent.eval(), scenes, state
+
+
+def _load_weights(agent: Agent, state: Mapping[str, Any], path: str | Path) -> None:
+    try:
+        agent.load_state_dict(state["agent"])
+    except RuntimeError as error:
+        first = str(error).splitlines()[-1].strip()
+        raise CheckpointError(
+            f"{path}: its weights do not fit a {agent.config['model']} agent ({first})"
+        ) from error
