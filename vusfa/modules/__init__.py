@@ -13,7 +13,7 @@ from vusfa.modules.frames import FeatureFrames, PictureFrames
 from vusfa.modules.linear import HistoryLinear, SceneLinear
 from vusfa.modules.policy import PolicyHead, SuccessorPolicyHead
 from vusfa.modules.presets import MODELS, PRESETS, AgentConfig, resolve_config
-from vusfa.modules.siamese import SiameseEncoder, frozen
+from vusfa.modules.siamese import NormalisedEncoder, SiameseEncoder, frozen
 from vusfa.modules.successor import RewardHead, SuccessorHead, SuccessorValue, ValueHead
 from vusfa.modules.trunk import Fusion, SceneLayer
 
@@ -27,6 +27,7 @@ __all__ = [
     "GaussianEncoder",
     "HistoryLinear",
     "LatentSampler",
+    "NormalisedEncoder",
     "PictureFrames",
     "PolicyHead",
     "RewardHead",

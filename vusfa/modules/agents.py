@@ -75,7 +75,7 @@ class Agent(nn.Module):
 
     | key | shape | written by |
     |---|---|---|
-    | ``state_embedding``, ``goal_embedding`` | (\\*B, E) | encoder; with a bottleneck these are the means |
+    | ``state_embedding``, ``goal_embedding`` | (\\*B, E) | encoder; with a bottleneck the means |
     | ``state_loc``, ``state_scale``, ``goal_loc``, ``goal_scale`` | (\\*B, E) | encoder with a bottleneck |
     | ``goal_latent`` | (\\*B, E) | bottleneck: z_g |
     | ``hidden`` | (\\*B, hidden_size) | scene layer |

@@ -159,10 +159,10 @@ class HistoryLinear(nn.Module):
         Returns:
             (\\*B, out), what :meth:`forward` gives on the frames themselves.
         """
-        places = (index * self.history + torch.arange(self.history, device=index.device)).flatten(0, -2)
+        places = index * self.history + torch.arange(self.history, device=index.device)
         # One kernel looks up and sums, forwards and backwards; five to ten times faster than indexing,
         # then sum.
-        sums = functional.embedding_bag(places, projected.flatten(0, 1), mode="sum")
+        sums = functional.embedding_bag(places.view(-1, self.history), projected.flatten(0, 1), mode="sum")
         return (sums + self.bias).view(*index.shape[:-1], -1)
 
     def extra_repr(self) -> str:

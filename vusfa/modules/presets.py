@@ -175,7 +175,7 @@ def resolve_config(model: str, preset: str = "controlled", **overrides: Any) -> 
         settings["history"] = 1
     settings.update(overrides)
     if "picture_size" in settings:
-        settings["picture_size"] = tuple(int(side) for side in settings["picture_size"])
+        settings["picture_size"] = _two_sides(settings["picture_size"])
     return _checked(AgentConfig(model=model, preset=preset, **settings))
 
 
@@ -213,6 +213,14 @@ def _checked(config: AgentConfig) -> AgentConfig:
                 " without embedding_layer they must be equal"
             )
     return config
+
+
+def _two_sides(size: Any) -> tuple[int, int]:
+    try:
+        height, width = (int(side) for side in size)
+    except (TypeError, ValueError):
+        raise ConfigError(f"picture_size is {size!r}; give height and width, such as [60, 80]") from None
+    return height, width
 
 
 def _default(name: str) -> Any:

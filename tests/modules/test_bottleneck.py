@@ -1,0 +1,79 @@
+from __future__ import annotations
+
+import pytest
+import torch
+
+from vusfa.errors import ConfigError
+from vusfa.modules import FeatureFrames, GaussianEncoder, LatentSampler, SiameseEncoder
+from vusfa.scenes import SceneSet
+
+
+def gaussian(scenes: SceneSet, **options: object) -> GaussianEncoder:
+    torch.manual_seed(0)
+    return GaussianEncoder(SiameseEncoder(FeatureFrames(scenes.features), 4, 16, 2 * 8), **options)
+
+
+class TestGaussianEncoder:
+    def test_means_are_the_embeddings(self, scenes: SceneSet) -> None:
+        module = gaussian(scenes)
+        inputs = torch.randint(21, (3, 4)), torch.randint(21, (3,))
+        state, goal, state_loc, state_scale, goal_loc, goal_scale = module(*inputs)
+        state_code, goal_code = module.encoder(*inputs)
+        assert state is state_loc
+        assert goal is goal_loc
+        assert torch.equal(state_loc, state_code[:, :8])
+        assert torch.equal(goal_loc, goal_code[:, :8])
+        torch.testing.assert_close(state_scale, (1 + state_code[:, 8:].exp()).log())
+        torch.testing.assert_close(goal_scale, (1 + goal_code[:, 8:].exp()).log())
+
+    def test_raw_scales_take_both_signs(self, scenes: SceneSet) -> None:
+        module = gaussian(scenes, scale="raw")
+        scale = module(torch.randint(21, (30, 4)), torch.randint(21, (30,)))[3]
+        assert (scale < 0).any()
+        assert (scale > 0).any()
+
+    @pytest.mark.parametrize("initial_scale", [0.05, 0.5, 2.0])
+    def test_scales_start_where_asked(self, scenes: SceneSet, initial_scale: float) -> None:
+        module = gaussian(scenes, initial_scale=initial_scale)
+        scale = module(torch.randint(21, (30, 4)), torch.randint(21, (30,)))[3]
+        assert scale.median().item() == pytest.approx(initial_scale, rel=0.25)
+
+    @pytest.mark.parametrize(
+        ("options", "message"),
+        [
+            ({"scale": "exp"}, "scale is 'exp'"),
+            ({"scale": "raw", "initial_scale": 0.1}, "initial_scale is 0.1 with scale 'raw'"),
+            ({"initial_scale": 0.0}, "initial_scale is 0.0"),
+        ],
+    )
+    def test_errors(self, scenes: SceneSet, options: dict[str, object], message: str) -> None:
+        with pytest.raises(ConfigError, match=message):
+            gaussian(scenes, **options)
+
+
+class TestLatentSampler:
+    def test_moments_in_training(self) -> None:
+        torch.manual_seed(0)
+        loc, scale = torch.tensor([1.0, -2.0]), torch.tensor([0.5, 2.0])
+        draws = LatentSampler()(loc.expand(20_000, 2), scale.expand(20_000, 2))
+        torch.testing.assert_close(draws.mean(0), loc, atol=0.05, rtol=0)
+        torch.testing.assert_close(draws.std(0), scale, atol=0.05, rtol=0)
+
+    def test_by_hand(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        sampler = LatentSampler()
+        monkeypatch.setattr(sampler, "noise", lambda loc: torch.tensor([2.0, -1.0]))
+        assert sampler(torch.tensor([1.0, 1.0]), torch.tensor([3.0, 0.5])).tolist() == [7.0, 0.5]
+
+    def test_the_gradient_reaches_mean_and_scale(self) -> None:
+        loc, scale = torch.zeros(4, requires_grad=True), torch.ones(4, requires_grad=True)
+        z = LatentSampler()(loc, scale)
+        z.sum().backward()
+        assert loc.grad.tolist() == [1.0] * 4
+        torch.testing.assert_close(scale.grad, z.detach())  # with mean 0 and scale 1, z is the noise
+
+    def test_evaluation(self) -> None:
+        loc, scale = torch.zeros(4), torch.ones(4)
+        assert LatentSampler().eval()(loc, scale) is loc
+        assert LatentSampler("sample").eval()(loc, scale).any()
+        with pytest.raises(ConfigError, match="eval_latent is 'median'"):
+            LatentSampler("median")
