@@ -255,7 +255,8 @@ class TargetNavEnv(EnvBase):
         """One step, and new episodes where one ended.
 
         The same as :class:`EnvBase` does, draw for draw, without the detour through :meth:`reset`, which
-        checks and merges what is known here; with many rows some episode ends at almost every step.
+        checks and merges what is known here; with many rows some episode ends at almost every step. Entries
+        that the environment does not know, such as a policy's outputs, stay as they are.
         """
         if tensordict.device != self.device:
             tensordict = tensordict.to(self.device)
@@ -382,7 +383,7 @@ class TargetNavEnv(EnvBase):
         super()._apply(fn, recurse)
         self._world = _map(fn, self._world)
         device = self._world.successor.device
-        if device.type != self._generator.device.type or device != self._generator.device:
+        if device != self._generator.device:
             # A generator's state means nothing on another kind of device: draws begin again from the seed.
             self._generator = torch.Generator(device)
             self._set_seed(self._seed)
@@ -433,14 +434,10 @@ class TargetNavEnv(EnvBase):
             state_id, goal_id = self._shown
         else:
             raise ConfigError("there is nothing to render yet; call reset() first, or pass a tensordict")
-        index = (
-            row
-            if isinstance(row, tuple)
-            else np.unravel_index(row, self.batch_size)
-            if self.batch_size
-            else ()
-        )
         try:
+            index = (
+                row if isinstance(row, tuple) else np.unravel_index(row, self.batch_size or (1,))[: self.ndim]
+            )
             trail, goal = state_id[index].tolist(), int(goal_id[index])
         except (IndexError, ValueError) as error:
             raise ConfigError(f"there is no row {row}; the batch is {tuple(self.batch_size)}") from error
