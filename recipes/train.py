@@ -17,14 +17,14 @@ import torch
 from omegaconf import DictConfig, OmegaConf
 
 from vusfa.envs import resolve_goals
-from vusfa.evaluation import compare, print_summary
+from vusfa.evaluation import Comparison, compare, print_summary
 from vusfa.modules import make_agent
 from vusfa.scenes import SceneSet
 from vusfa.training import (
     ProgressLine,
     Session,
     StopOnSignal,
-    collecting,
+    check_goals_dealt,
     descend,
     learning_rate,
     make_collector,
@@ -38,7 +38,7 @@ from vusfa.training import (
 from vusfa.training.launch import launch
 
 
-def train(cfg: DictConfig, overrides: list[str]) -> tuple[Session, int]:
+def train(cfg: DictConfig, overrides: list[str]) -> tuple[Session, Comparison | None, int]:
     """Trains, and leaves a checkpoint and an evaluation in ``cfg.folder``.
 
     Args:
@@ -46,89 +46,86 @@ def train(cfg: DictConfig, overrides: list[str]) -> tuple[Session, int]:
         overrides: the command line that made them, for whoever resumes.
 
     Returns:
-        the session, and the exit code: 0, or 130 or 143 when a signal ended the training.
+        the session, its evaluation, if there was any, and the exit code: 0, or 130 or 143 when a signal ended
+        it.
     """
     torch.manual_seed(cfg.seed)
-    device, folder = torch.device(cfg.device), Path(cfg.folder)
+    device, checkpoint = torch.device(cfg.device), Path(cfg.folder) / "checkpoint.pt"
     plain: dict[str, Any] = OmegaConf.to_container(cfg, resolve=True)  # type: ignore[assignment]
+    optim = plain["optim"]
+    half = partial(torch.autocast, device.type, torch.bfloat16, enabled=cfg.autocast)
 
     # The world, the agent, and what it learns by.
     scenes = SceneSet.open(cfg.scenes)
     goals = resolve_goals(scenes, plain["env"]["goals"])
+    check_goals_dealt(len(goals), cfg.collector.num_envs, cfg.env.goal_sampling)
     agent = make_agent(scenes=scenes, **{k: v for k, v in plain["agent"].items() if v is not None}).to(device)
     actor, critic = agent.get_policy_operator(), agent.get_value_operator()
     loss, estimator, multiplier = make_loss(actor, critic, **plain["objective"])
-    optim = plain["optim"]
     optimiser = make_optimiser(
         agent.parameters(), optim["kind"], optim["lr"], optim["max_grad_norm"], **optim["options"]
     )
 
-    # Who walks.
-    env = partial(
-        make_env, scenes, agent.make_env_transforms(), history=agent.config["history"], device=device
-    )
-    env = partial(env, **(plain["env"] | {"goals": goals}))
-    half = partial(torch.autocast, device.type, torch.bfloat16, enabled=cfg.autocast)
-    with half():
-        collector = make_collector(
-            make_env=env, policy=actor, seed=cfg.seed, autocast=cfg.autocast, **plain["collector"]
-        )
-
-    # What is saved, and who is told.
+    # What is saved, who walks, and who is told.
     settings = {"config": plain, "overrides": overrides, "sources": scene_sources(cfg.scenes)}
-    session = Session(scenes, goals, agent, loss.to(device), optimiser, collector, settings)
+    session = Session(scenes, goals, agent, loss.to(device), optimiser, settings)
     if cfg.resume:
         session.resume(cfg.resume)
-    resumed = session.frames if cfg.resume else None
-    loggers = make_loggers(
-        folder=folder, config=plain, run_id=session.run_id, resume_frames=resumed, **plain["logger"]
+    history = agent.config["history"]
+    env = partial(make_env, scenes, agent.make_env_transforms(), history=history, device=device)
+    env = partial(env, **{**plain["env"], "goals": goals})
+    collector = partial(
+        make_collector, make_env=env, policy=actor, seed=cfg.seed, autocast=cfg.autocast, **plain["collector"]
     )
-    progress = ProgressLine(cfg.total_frames)
+    resumed = session.frames if cfg.resume else None
+    tell = make_loggers(
+        folder=cfg.folder, config=plain, run_id=session.run_id, resume_frames=resumed, **plain["logger"]
+    )
 
-    with StopOnSignal() as stop, collecting(collector) as batches:
-        while session.frames < cfg.total_frames and not stop.received:
-            began = time.monotonic()
-            with half():
-                batch = next(batches).to(device)
-                terms = loss(estimator(batch))
-            lr = learning_rate(session.frames, optim["lr"], optim["horizon"])
-            norm = descend(optimiser, total_loss(loss, terms), lr, optim["max_grad_norm"])
-            if multiplier is not None:
-                multiplier.step()
+    with tell as loggers:
+        progress = ProgressLine(cfg.total_frames)
+        with StopOnSignal() as stop, session.collecting(collector) as batches, progress:
+            while session.frames < cfg.total_frames and not stop.received:
+                began, before = time.monotonic(), session.frames
+                # Three blocks: autocast keeps weights that it converted without gradients until its block
+                # ends.
+                with half():
+                    batch = next(batches)
+                with half():
+                    estimator(batch)
+                with half():
+                    terms = loss(batch)
+                lr = learning_rate(before, optim["lr"], optim["horizon"])
+                norm = descend(optimiser, total_loss(loss, terms), lr, optim["max_grad_norm"])
+                if multiplier is not None:
+                    multiplier.step()
 
-            before = session.frames
-            session.count(batch, {**terms, "grad_norm": norm}, time.monotonic() - began)
-            progress.update(session.frames)
-            if before // cfg.log_every < session.frames // cfg.log_every:
-                metrics = session.metrics()
-                loggers.log_metrics(metrics, session.frames)
-                progress.rates(metrics["success"], metrics["length_ratio"])
-            if before // cfg.checkpoint_every < session.frames // cfg.checkpoint_every:
-                loggers.log_checkpoint(session.save(folder / "checkpoint.pt"), session.frames)
-        progress.close()
-        loggers.log_checkpoint(session.save(folder / "checkpoint.pt"), session.frames)
+                session.count(batch, {**terms, "grad_norm": norm}, time.monotonic() - began)
+                progress.update(session.frames)
+                if before // cfg.log_every < session.frames // cfg.log_every:
+                    metrics = session.metrics()
+                    loggers.log_metrics(metrics, session.frames)
+                    progress.rates(metrics["success"], metrics["length_ratio"])
+                if before // cfg.checkpoint_every < session.frames // cfg.checkpoint_every:
+                    loggers.log_checkpoint(session.save(checkpoint), session.frames)
+            loggers.log_checkpoint(session.save(checkpoint), session.frames)
+        loggers.exit_code = stop.exit_code
 
-    if cfg.evaluation.goals and not stop.received:
-        wanted = goals if cfg.evaluation.goals == "trained" else cfg.evaluation.goals
-        options = {k: v for k, v in plain["evaluation"].items() if k != "goals"}
-        result = compare(
-            {agent.config["model"]: actor},
-            scenes,
-            wanted,
-            trained=goals,
-            history=agent.config["history"],
-            **options,
-        )
-        result.save(folder / "evaluation")
-        loggers.log_table("evaluation", result.rows, session.frames)
-        print_summary(result.rows, note=result.note)
-    loggers.close(stop.exit_code)
-    return session, stop.exit_code
+        result = None
+        if cfg.evaluation.goals and not stop.received:
+            options = {**plain["evaluation"], "history": history}
+            wanted = options.pop("goals")
+            wanted = goals if wanted == "trained" else wanted
+            result = compare({agent.config["model"]: actor}, scenes, wanted, trained=goals, **options)
+            result.save(checkpoint.with_name("evaluation"))
+            loggers.log_table("evaluation", result.rows, session.frames)
+            print_summary(result.rows, note=result.note)
+    return session, result, stop.exit_code
 
 
 def main(cfg: DictConfig, overrides: list[str]) -> int:
-    """Trains, says where the results are."""
-    _, exit_code = train(cfg, overrides)
+    """Trains, and says where the results are."""
+    _, _, exit_code = train(cfg, overrides)
     print(f"{cfg.folder}/checkpoint.pt", file=sys.stderr)
     return exit_code
 

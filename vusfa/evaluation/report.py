@@ -132,7 +132,7 @@ def count_pairs(scenes: Iterable[Scene], unreachable: Unreachable) -> str:
     if not lost:
         return "Every goal can be reached from every start."
     counted = {
-        "skip": "no episode starts where its goal cannot be reached; a goal that no state reaches is left out",
+        "skip": "no episode starts where its goal cannot be reached; a goal without starts is left out",
         "fail": "such pairs are drawn as any other, and count as failures",
     }[unreachable]
     listed = ", ".join(f"{count} in {name}" for name, count in lost.items())

@@ -4,7 +4,7 @@
 """
 
 from vusfa.training.checkpoint import load_checkpoint, save_checkpoint
-from vusfa.training.collectors import collecting, make_collector, make_env
+from vusfa.training.collectors import check_goals_dealt, make_collector, make_env
 from vusfa.training.learning import descend, learning_rate, make_loss, make_optimiser, total_loss
 from vusfa.training.loggers import make_loggers
 from vusfa.training.metrics import EpisodeMeter, MeanMeter
@@ -18,7 +18,7 @@ __all__ = [
     "ProgressLine",
     "Session",
     "StopOnSignal",
-    "collecting",
+    "check_goals_dealt",
     "descend",
     "learning_rate",
     "load_agent",

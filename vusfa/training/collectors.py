@@ -12,13 +12,12 @@ All rows are dealt the same goals whichever way they are spread over processes.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any
 
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDict
 from tensordict.nn import TensorDictModuleBase
 from torchrl.collectors import BaseCollector, Collector, MultiAsyncCollector, MultiSyncCollector
 from torchrl.envs import EnvBase, TransformedEnv
@@ -31,7 +30,7 @@ from vusfa.training.signals import ignore_interrupts
 
 __all__ = [
     "KINDS",
-    "collecting",
+    "check_goals_dealt",
     "collector_state",
     "load_collector_state",
     "make_collector",
@@ -88,6 +87,21 @@ def rows_per_worker(kind: str, num_envs: int, num_workers: int) -> int:
     return num_envs // num_workers
 
 
+def check_goals_dealt(num_goals: int, num_envs: int, goal_sampling: str) -> None:
+    """Refuse environments too few for goals that stay with their environment: some would never be walked to.
+
+    >>> check_goals_dealt(num_goals=5, num_envs=4, goal_sampling="fixed")
+    Traceback (most recent call last):
+    ...
+    vusfa.errors.ConfigError: collector.num_envs=4 leaves some of the 5 goals without an environment; give ...
+    """
+    if goal_sampling == "fixed" and num_envs < num_goals:
+        raise ConfigError(
+            f"collector.num_envs={num_envs} leaves some of the {num_goals} goals without an environment;"
+            f" give {num_goals} or more, or env.goal_sampling=episode"
+        )
+
+
 def make_collector(
     kind: str,
     make_env: MakeEnv,
@@ -124,8 +138,10 @@ def make_collector(
         "auto_register_policy_transforms": False,
         "use_buffers": True,
     }
+    # Made here in any case: what is wrong with the settings then shows as an error of ours, not as a
+    # worker's.
+    env = make_env(batch_size=[rows], first_goal=0, seed=seed)
     if kind == "single":
-        env = make_env(batch_size=[rows], first_goal=0, seed=seed)
         return Collector(env, policy, frames_per_batch=rows * rollout, track_traj_ids=False, **shared)
     makers = [
         partial(make_env, batch_size=[rows], first_goal=worker * rows, seed=seed + worker)
@@ -155,20 +171,6 @@ def _begin_worker(autocast: bool) -> None:
         torch.set_autocast_enabled("cpu", True)
         # The cache would keep weights converted before an update for as long as the worker lives.
         torch.set_autocast_cache_enabled(False)
-
-
-@contextmanager
-def collecting(collector: BaseCollector) -> Iterator[Iterator[TensorDictBase]]:
-    """The collector's batches; on the way out, however one leaves, its processes end.
-
-    Closing a collector changes this process's number of threads; that is put right, too.
-    """
-    threads = torch.get_num_threads()
-    try:
-        yield iter(collector)
-    finally:
-        collector.shutdown()
-        torch.set_num_threads(threads)
 
 
 def collector_state(collector: BaseCollector) -> dict[str, Any]:

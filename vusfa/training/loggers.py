@@ -8,6 +8,7 @@ import math
 import os
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from types import TracebackType
 from typing import Any, Protocol
 
 from vusfa.errors import ConfigError
@@ -58,20 +59,30 @@ class CSVLogger:
         self, folder: str | Path, config: Mapping[str, Any], resume_frames: int | None = None
     ) -> None:
         self.folder = Path(folder)
+        self._config = dict(config)
         self._file = self.folder / "metrics.csv"
+        self._resume_frames = resume_frames
         self._columns: list[str] | None = None
-        write_json(self.folder / "config.json", config)
-        if resume_frames is None:
+        self._begun = False
+
+    def _begin(self) -> None:
+        """Only now, so that a training that cannot begin leaves nothing behind."""
+        if self._begun:
+            return
+        self._begun = True
+        write_json(self.folder / "config.json", self._config)
+        if self._resume_frames is None:
             self._file.unlink(missing_ok=True)
         elif self._file.is_file():
             with open(self._file, newline="", encoding="utf-8") as file:
                 reader = csv.DictReader(file)
-                kept = [row for row in reader if _frames(row) <= resume_frames]
+                kept = [row for row in reader if _frames(row) <= self._resume_frames]
                 self._columns = list(reader.fieldnames or ()) or None
             write_csv(self._file, kept, self._columns)
 
     def log_metrics(self, metrics: Mapping[str, float], frames: int) -> None:
         """Append one row; the first one decides on the columns."""
+        self._begin()
         row = {"frames": frames, **metrics}
         new = self._columns is None
         self._columns = self._columns or list(row)
@@ -85,9 +96,11 @@ class CSVLogger:
 
     def log_checkpoint(self, path: Path, frames: int) -> None:
         """The file itself is the record."""
+        self._begin()
 
     def log_table(self, name: str, rows: Sequence[Mapping[str, Any]], frames: int) -> None:
         """Write ``NAME.csv``."""
+        self._begin()
         write_csv(self.folder / f"{name}.csv", rows)
 
     def close(self, exit_code: int = 0) -> None:
@@ -195,10 +208,23 @@ class WandbLogger:
 
 
 class Loggers:
-    """Several loggers as one; whatever happens is told to each."""
+    """Several loggers as one; whatever happens is told to each. As a context, closes them on the way out.
+
+    Attributes:
+        exit_code: what to close them with; an exception closes them with 1.
+    """
 
     def __init__(self, loggers: Sequence[Logger]) -> None:
         self.loggers = tuple(loggers)
+        self.exit_code = 0
+
+    def __enter__(self) -> Loggers:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close(self.exit_code if error is None else 1)
 
     def log_metrics(self, metrics: Mapping[str, float], frames: int) -> None:
         """See :class:`Logger`."""

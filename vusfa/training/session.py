@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import secrets
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -42,7 +43,7 @@ class Session:
     Args:
         scenes: the world.
         goals: (G,) global ids of the goals trained on.
-        agent, loss, optimiser, collector: the parts; the collector not yet iterated.
+        agent, loss, optimiser: what learns.
         settings: what the checkpoint shall say of how all this was made: plain data under ``config``,
             ``overrides`` and ``sources`` (what was given as scenes).
 
@@ -60,7 +61,6 @@ class Session:
     agent: Agent
     loss: LossModule
     optimiser: torch.optim.Optimizer
-    collector: BaseCollector
     settings: Mapping[str, Any]
     frames: int = 0
     updates: int = 0
@@ -70,6 +70,31 @@ class Session:
     def __post_init__(self) -> None:
         self.episodes = EpisodeMeter(self.scenes, self.goals)
         self.terms = MeanMeter()
+        self._collector: BaseCollector | None = None
+        self._waiting: dict[
+            str, Any
+        ] = {}  # of a checkpoint: what can be restored only once there is a collector
+
+    @contextmanager
+    def collecting(self, make: Callable[[], BaseCollector]) -> Iterator[Iterator[TensorDictBase]]:
+        """Makes a collector and gives its batches, from where a resumed checkpoint stood; in the end its
+        processes end, too.
+
+        A collector with workers changes this process's number of threads; that is put right.
+        """
+        threads = torch.get_num_threads()
+        collector = make()
+        try:
+            self._collector = collector
+            if self._waiting:
+                load_collector_state(collector, self._waiting["collector"])
+                restore_random_state(self._waiting["rng"])  # last: what came before has drawn
+                self._waiting = {}
+            yield iter(collector)
+        finally:
+            self._collector = None
+            collector.shutdown()
+            torch.set_num_threads(threads)
 
     def count(self, batch: TensorDictBase, terms: Mapping[str, Tensor], seconds: float) -> None:
         """One update has been made.
@@ -95,7 +120,11 @@ class Session:
         return head | self.episodes.flush() | self.terms.flush()
 
     def save(self, path: str | Path) -> Path:
-        """Write a checkpoint, atomically; see :mod:`vusfa.training.checkpoint`."""
+        """Write a checkpoint, atomically, while collecting; see :mod:`vusfa.training.checkpoint`."""
+        if self._collector is None:
+            raise RuntimeError(
+                "a session is saved within collecting(): where the environments stand belongs to it"
+            )
         return save_checkpoint(
             path,
             {
@@ -115,7 +144,7 @@ class Session:
                 "agent": self.agent.state_dict(),
                 "loss": loss_state(self.loss),
                 "optimiser": self.optimiser.state_dict(),
-                "collector": collector_state(self.collector),
+                "collector": collector_state(self._collector),
                 "meter": {"episodes": self.episodes.state_dict(), "terms": self.terms.state_dict()},
                 "rng": random_state(),
             },
@@ -144,8 +173,7 @@ class Session:
         self.terms.load_state_dict(state["meter"]["terms"])
         for name in ("frames", "updates", "seconds", "run_id"):
             setattr(self, name, state[name])
-        load_collector_state(self.collector, state["collector"])
-        restore_random_state(state["rng"])  # last: what came before may have drawn
+        self._waiting = {"collector": state["collector"], "rng": state["rng"]}
 
 
 def scene_sources(scenes: str | Sequence[str]) -> list[str]:

@@ -1,0 +1,39 @@
+"""Trains VUSFA on the bundled bathroom's five goals, evaluates it, films a walk: make demo, or python
+recipes/demo.py
+
+Settings are in recipes/conf/demo.yaml. Everything goes to the folder demo: the checkpoint, the tables,
+walk.gif, curve.png.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from omegaconf import DictConfig
+from train import train
+
+from vusfa.evaluation.curve import plot_curve
+from vusfa.evaluation.film import draw_film, longest_success, record_walk, write_gif
+from vusfa.training.launch import launch
+
+
+def demo(cfg: DictConfig, overrides: list[str]) -> int:
+    """Trains as recipes/train.py does; then the film and the curve."""
+    session, result, exit_code = train(cfg, overrides)
+    if result is None:
+        return exit_code
+    folder, agent, scenes = Path(cfg.folder), session.agent.eval(), session.scenes
+    floor = next(row for row in result.rows if row["policy"] == "random walk" and row["goals"] == "trained")
+    made = [plot_curve(folder / "metrics.csv", folder / "curve.png", floor["success_500"], cfg.agent.model)]
+    found = longest_success(result.episodes, scenes)
+    if found is not None:
+        start, goal = found
+        trail = record_walk(agent.get_policy_operator(), scenes, start, goal, history=agent.config["history"])
+        made.append(write_gif(folder / "walk.gif", draw_film(scenes, trail, goal)))
+    for path in [*made, folder / "evaluation.csv", folder / "checkpoint.pt"]:
+        print(path)
+    return exit_code
+
+
+if __name__ == "__main__":
+    launch(demo, Path(__file__).parent / "conf", "demo")

@@ -1,0 +1,65 @@
+"""The learning curve of a run as a picture."""
+
+from __future__ import annotations
+
+import csv
+import math
+from pathlib import Path
+
+from vusfa.errors import ConfigError
+from vusfa.evaluation.files import replacing
+
+__all__ = ["plot_curve", "read_metrics"]
+
+
+def read_metrics(path: str | Path) -> dict[str, list[float]]:
+    """The columns of a run's ``metrics.csv``; an empty field is NaN.
+
+    Raises:
+        ConfigError: there is no such file, or it has no rows.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise ConfigError(f"{path}: no such file; a run with logger csv writes metrics.csv in its folder")
+    with open(path, newline="", encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    if not rows:
+        raise ConfigError(f"{path}: no rows yet; train for longer, or log more often (log_every)")
+    return {key: [float(row[key] or math.nan) for row in rows] for key in rows[0]}
+
+
+def plot_curve(metrics: str | Path, path: str | Path, floor: float | None = None, title: str = "") -> Path:
+    """Success and length over shortest path against frames, as PNG, atomically.
+
+    Args:
+        metrics: the run's ``metrics.csv``.
+        path: where to.
+        floor: success of the random walk, drawn as a line.
+        title: above the picture.
+
+    Raises:
+        ConfigError: see :func:`read_metrics`.
+    """
+    from matplotlib.figure import Figure  # of the extra "recipes"
+
+    columns = read_metrics(metrics)
+    frames = [f / 1000 for f in columns["frames"]]
+    figure = Figure(figsize=(7, 4.5), layout="constrained")
+    upper, lower = figure.subplots(2, 1, sharex=True)
+    upper.plot(frames, [100 * s for s in columns["success"]], color="#1f61b6")
+    upper.set_ylabel("success in training (%)")
+    upper.set_ylim(0, 102)
+    if floor is not None:
+        upper.axhline(100 * floor, color="#888888", linestyle="--", label="random walk")
+        upper.legend(loc="lower right", frameon=False)
+    lower.plot(frames, columns["length_ratio"], color="#d6452c")
+    lower.axhline(1.0, color="#888888", linestyle="--", label="shortest path")
+    lower.set_yscale("log")
+    lower.set_ylabel("length / shortest")
+    lower.set_xlabel("thousand frames")
+    lower.legend(loc="upper right", frameon=False)
+    if title:
+        upper.set_title(title)
+    with replacing(path) as unfinished:
+        figure.savefig(unfinished, format="png", dpi=120)
+    return Path(path)

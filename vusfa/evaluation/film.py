@@ -1,0 +1,148 @@
+"""One walk as a short film: what the agent sees, what it looks for, and where it is."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import torch
+from PIL import Image, ImageDraw, ImageFont
+from tensordict.nn import TensorDictModuleBase
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+
+from vusfa.envs import TargetNavEnv
+from vusfa.envs.rendering import draw_panels
+from vusfa.evaluation.episodes import Episodes
+from vusfa.evaluation.files import replacing
+from vusfa.scenes import SceneSet
+
+__all__ = ["draw_film", "longest_success", "record_walk", "write_gif"]
+
+_TITLE_HEIGHT = 22
+_INK, _PAPER = (60, 64, 72), (255, 255, 255)
+
+
+def longest_success(episodes: Episodes, scenes: SceneSet) -> tuple[int, int] | None:
+    """Start and goal, global ids, of the successful episode with the longest way to go; None when all failed.
+
+    Of several the one with the fewest detours. Trained goals come first.
+    """
+    found = [row for row in episodes.rows() if row["success"]]
+    if not found:
+        return None
+    best = max(found, key=lambda row: (row["trained"], row["shortest"], -row["length"]))
+    return int(scenes.global_id(best["scene"], best["start"])), int(
+        scenes.global_id(best["scene"], best["goal"])
+    )
+
+
+@torch.no_grad()
+def record_walk(
+    policy: TensorDictModuleBase,
+    scenes: SceneSet,
+    start: int,
+    goal: int,
+    *,
+    max_steps: int = 500,
+    history: int = 4,
+    attempts: int = 10,
+    seed: int = 0,
+) -> list[int]:
+    """Lets a policy walk, with sampled actions, and notes the way.
+
+    Args:
+        policy: reads ``state_id``, ``goal_id`` and ``scene_id``, writes ``action``.
+        scenes: the world, on the policy's device.
+        start, goal: global state ids.
+        max_steps: actions allowed.
+        history: frames in ``state_id``.
+        attempts: walks to try; the shortest of them that arrives is taken, the last one when none does.
+        seed: of the actions; the caller's random state is left as it was.
+
+    Returns:
+        global ids of the states on the way, start and end included.
+    """
+    env = TargetNavEnv(
+        scenes,
+        goals=[goal],
+        batch_size=[attempts],
+        history=history,
+        max_steps=max_steps,
+        device=scenes.device,
+    )
+    devices = [scenes.device] if scenes.device.type == "cuda" else []
+    with torch.random.fork_rng(devices), set_exploration_type(ExplorationType.RANDOM):
+        torch.manual_seed(seed)
+        walks = env.rollout(
+            max_steps,
+            policy,
+            auto_reset=False,
+            tensordict=env.set_state(start, goal),
+            break_when_all_done=True,
+        )
+    end = walks["next", "done"].squeeze(-1).to(torch.int64).argmax(-1)  # first done of each row
+    arrived = walks["next", "terminated"].squeeze(-1).any(-1)
+    best = int(torch.where(arrived, end, max_steps).argmin()) if bool(arrived.any()) else attempts - 1
+    states = walks["next", "state_id"][best, : int(end[best]) + 1, -1]
+    return [start, *states.tolist()]
+
+
+def draw_film(scenes: SceneSet, trail: Sequence[int], goal: int, scale: int = 2) -> list[Image.Image]:
+    """One picture a state of the way; a scene without pictures shows the map alone.
+
+    Args:
+        scenes: the world.
+        trail: global ids of the states on the way.
+        goal: global id.
+        scale: how much larger than the scene's pictures.
+
+    >>> scenes = SceneSet.bundled(["bathroom"])
+    >>> [picture.size for picture in draw_film(scenes, [72, 73], goal=73)]
+    [(1132, 322), (1132, 322)]
+    """
+    scene = scenes.scenes[int(scenes.scene_id[goal])]
+    panels = {"view": "it sees", "goal": "it looks for", "map": ""} if scene.has_pictures else {"map": ""}
+    shortest = int(scenes.distance(trail[0], goal))
+    film = []
+    for step in range(len(trail)):
+        drawn = Image.fromarray(draw_panels(scenes, trail[: step + 1], goal, list(panels)))
+        drawn = drawn.resize((scale * drawn.width, scale * drawn.height), Image.Resampling.LANCZOS)
+        picture = Image.new("RGB", (drawn.width, drawn.height + _TITLE_HEIGHT), _PAPER)
+        picture.paste(drawn, (0, _TITLE_HEIGHT))
+        draw = ImageDraw.Draw(picture)
+        words = dict(panels, map=f"step {step}, {shortest} is the fewest")
+        left = 0
+        for panel, title in words.items():
+            draw.text((left + 2, 3), title, fill=_INK, font=ImageFont.load_default(14))
+            width = scene.picture_shape[1] if scene.picture_shape is not None and panel != "map" else 0
+            left += scale * (width + 8)
+        film.append(picture)
+    return film
+
+
+def write_gif(path: str | Path, film: Sequence[Image.Image], frames_per_second: float = 4.0) -> Path:
+    """Write a GIF that starts over after a pause on its last picture, atomically.
+
+    Raises:
+        ValueError: no pictures.
+    """
+    if not film:
+        raise ValueError("a film needs at least one picture")
+    pause = round(1000 / frames_per_second)
+    durations = [pause] * (len(film) - 1) + [8 * pause]
+    # One palette for all pictures: each with its own would make the colours flicker.
+    strip = Image.new("RGB", (film[0].width, film[0].height * min(len(film), 8)))
+    for place, picture in enumerate(film[:: max(1, len(film) // 8)][:8]):
+        strip.paste(picture, (0, place * picture.height))
+    palette = strip.quantize(256, method=Image.Quantize.MEDIANCUT)
+    pictures = [picture.quantize(palette=palette, dither=Image.Dither.FLOYDSTEINBERG) for picture in film]
+    with replacing(path) as unfinished:
+        pictures[0].save(
+            unfinished,
+            format="GIF",
+            save_all=True,
+            append_images=pictures[1:],
+            duration=durations,
+            loop=0,
+        )
+    return Path(path)
