@@ -114,7 +114,8 @@ def _cell_size(places: Tensor) -> float:
     """Distance between neighbouring places (P, 2); 1 where there is a single one."""
     if len(places) == 1:
         return 1.0
-    apart = torch.cdist(places[:256], places)
+    # the other mode, by matrix products, finds places 2 mm from themselves
+    apart = torch.cdist(places[:256], places, compute_mode="donot_use_mm_for_euclid_dist")
     return float(apart[apart > 1e-3].min())
 
 
