@@ -101,7 +101,7 @@ def draw_film(scenes: SceneSet, trail: Sequence[int], goal: int, scale: int = 2)
     [(1132, 322), (1132, 322)]
     """
     scene = scenes.scenes[int(scenes.scene_id[goal])]
-    panels = {"view": "it sees", "goal": "it looks for", "map": ""} if scene.has_pictures else {"map": ""}
+    panels = {"view": "what it sees", "goal": "what it looks for", "map": ""} if scene.has_pictures else {"map": ""}
     shortest = int(scenes.distance(trail[0], goal))
     film = []
     for step in range(len(trail)):
@@ -110,7 +110,7 @@ def draw_film(scenes: SceneSet, trail: Sequence[int], goal: int, scale: int = 2)
         picture = Image.new("RGB", (drawn.width, drawn.height + _TITLE_HEIGHT), _PAPER)
         picture.paste(drawn, (0, _TITLE_HEIGHT))
         draw = ImageDraw.Draw(picture)
-        words = dict(panels, map=f"step {step}, {shortest} is the fewest")
+        words = dict(panels, map=f"step {step}, shortest way {shortest}")
         left = 0
         for panel, title in words.items():
             draw.text((left + 2, 3), title, fill=_INK, font=ImageFont.load_default(14))

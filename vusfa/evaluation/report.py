@@ -37,10 +37,10 @@ Row = dict[str, Any]
 SUBSETS = ("trained", "unseen", "all")
 MEAN_OF_SCENES = "mean of scenes"
 MEAN_OF_STATES = "mean of states"
-_HEADS = {"spl": "SPL", "length": "length", "length_ratio": "ratio", "collisions": "collisions"}
+_HEADS = {"spl": "SPL", "length": "length", "length_ratio": "ratio", "collisions": "blocked"}
 _LEGEND = (
     "success within so many steps and SPL in %; length: steps of the successful episodes;"
-    " ratio: that over their shortest paths; collisions: in an episode"
+    " ratio: that over their shortest paths; blocked: collisions, in an episode"
 )
 
 
