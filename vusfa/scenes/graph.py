@@ -27,6 +27,7 @@ from vusfa.errors import GoalError
 __all__ = [
     "arrival_probability",
     "default_actions",
+    "narrow_distances",
     "policy_success",
     "random_walk_success",
     "shortest_path_distances",
@@ -113,10 +114,10 @@ def successor_table(graph: Tensor | np.ndarray) -> tuple[Tensor, Tensor]:
     >>> successor.tolist(), blocked.tolist()
     ([[1, 0], [1, 0]], [[False, True], [True, False]])
     """
-    table = torch.from_numpy(_as_table(graph).copy())
+    table = _as_table(graph)
     blocked = table < 0
-    stay = torch.arange(len(table)).unsqueeze(1).expand_as(table)
-    return torch.where(blocked, stay, table), blocked
+    successor = np.where(blocked, np.arange(len(table))[:, None], table)
+    return torch.from_numpy(successor), torch.from_numpy(blocked)
 
 
 def shortest_path_distances(graph: Tensor | np.ndarray) -> Tensor:
@@ -133,9 +134,17 @@ def shortest_path_distances(graph: Tensor | np.ndarray) -> Tensor:
     [[0, 1, 2], [-1, 0, 1], [-1, -1, 0]]
     """
     table = _as_table(graph)
-    distance = _breadth_first(_edges(table), np.arange(len(table)))
+    return narrow_distances(_breadth_first(_edges(table), np.arange(len(table))))
+
+
+def narrow_distances(distance: np.ndarray) -> Tensor:
+    """A table of distances as int16, or as int32 where one is longer than that holds; always a copy.
+
+    >>> narrow_distances(np.array([[0, 32767]])).dtype, narrow_distances(np.array([[0, 32768]])).dtype
+    (torch.int16, torch.int32)
+    """
     fits = not distance.size or distance.max() <= np.iinfo(np.int16).max
-    return torch.from_numpy(distance.astype(np.int16) if fits else distance)
+    return torch.from_numpy(distance.astype(np.int16 if fits else np.int32))
 
 
 def steps_to_goals(graph: Tensor | np.ndarray, goals: Any) -> Tensor:

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import h5py
 import numpy as np
-from PIL import Image
+from PIL import Image, UnidentifiedImageError
 
 from vusfa.errors import SceneError
 from vusfa.scenes.hdf5 import dataset_in, opened
@@ -34,8 +34,12 @@ def _find(file: h5py.File) -> tuple[str, h5py.Dataset] | None:
 
 
 def _decode(jpeg: np.ndarray) -> np.ndarray:
-    with Image.open(io.BytesIO(jpeg.tobytes())) as image:
-        return np.asarray(image.convert("RGB"))
+    try:
+        with Image.open(io.BytesIO(jpeg.tobytes())) as image:
+            return np.asarray(image.convert("RGB"))
+    except UnidentifiedImageError as error:
+        # Pillow's own words name an address in memory.
+        raise OSError("unknown format") from error
 
 
 def to_jpeg(picture: np.ndarray) -> bytes:

@@ -21,7 +21,7 @@ from torch import Tensor
 from vusfa.errors import SceneError
 from vusfa.scenes import store
 from vusfa.scenes.faults import DATASETS, array_faults, raise_faults
-from vusfa.scenes.graph import default_actions, shortest_path_distances, weak_components
+from vusfa.scenes.graph import default_actions, narrow_distances, shortest_path_distances, weak_components
 from vusfa.scenes.pictures import read_pictures
 
 __all__ = ["Scene"]
@@ -82,9 +82,8 @@ class Scene:
         if self.distance is None:
             distance = shortest_path_distances(arrays["graph"])
         else:
-            # Checked against the search above: a path is shorter than the number of states.
-            dtype = np.int16 if num_states <= np.iinfo(np.int16).max else np.int32
-            distance = _tensor(arrays["shortest_path_distance"], dtype)
+            # These were found equal to a search of the graph just now: no need for another.
+            distance = narrow_distances(arrays["shortest_path_distance"])
         checked = {
             "graph": _tensor(arrays["graph"], np.int64),
             "features": _tensor(arrays["resnet_feature"], np.float32),

@@ -12,6 +12,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -55,21 +56,22 @@ class SceneSet:
         self._build()
 
     def _build(self) -> None:
-        sizes = torch.tensor([scene.num_states for scene in self.scenes])
-        self.offsets = torch.cat([torch.zeros(1, dtype=torch.int64), sizes.cumsum(0)])
+        # In NumPy on purpose: torch joins large tensors on several threads, and those hang in a forked
+        # process whose parent has used them. Rooms must open there too.
+        sizes = [scene.num_states for scene in self.scenes]
+        offsets = np.cumsum([0, *sizes])
         tables = [successor_table(scene.graph) for scene in self.scenes]
-        self.successor = torch.cat(
-            [t + first for (t, _), first in zip(tables, self.offsets.tolist(), strict=False)]
-        )
-        self.blocked = torch.cat([blocked for _, blocked in tables])
-        self.features = torch.cat([scene.features for scene in self.scenes])
-        self.location = torch.cat([scene.location for scene in self.scenes])
-        self.rotation = torch.cat([scene.rotation for scene in self.scenes])
-        self.scene_id = torch.repeat_interleave(torch.arange(len(self.scenes)), sizes)
-        # One row-major N x N table after the other; S x S would be mostly "another scene".
-        dtype = max((scene.distance.dtype for scene in self.scenes), key=lambda d: d.itemsize)
-        self._distance = torch.cat([scene.distance.to(dtype).flatten() for scene in self.scenes])
-        self._distance_start = torch.cat([torch.zeros(1, dtype=torch.int64), (sizes * sizes).cumsum(0)])
+        self.offsets = torch.from_numpy(offsets)
+        firsts = offsets[:-1]
+        self.successor = _joined([t.numpy() + n for (t, _), n in zip(tables, firsts, strict=True)])
+        self.blocked = _joined([blocked.numpy() for _, blocked in tables])
+        self.features = _joined([scene.features.numpy() for scene in self.scenes])
+        self.location = _joined([scene.location.numpy() for scene in self.scenes])
+        self.rotation = _joined([scene.rotation.numpy() for scene in self.scenes])
+        self.scene_id = torch.from_numpy(np.repeat(np.arange(len(sizes)), sizes))
+        # One N x N table after the other, row by row; S x S would be mostly "another scene".
+        self._distance = _joined([scene.distance.numpy().ravel() for scene in self.scenes])
+        self._distance_start = torch.from_numpy(np.cumsum([0, *(size * size for size in sizes)]))
 
     @classmethod
     def bundled(cls, names: Sequence[str] | None = None) -> SceneSet:
@@ -223,26 +225,26 @@ class SceneSet:
             SceneError: no such state, a scene without pictures, or pictures of different sizes.
         """
         ids = torch.as_tensor(ids, dtype=torch.int64).cpu()
-        wrong = ids[(ids < 0) | (ids >= self.num_states)]
-        if wrong.numel():
-            raise SceneError(f"there is no state {int(wrong[0])}; this set has 0..{self.num_states - 1}")
-        flat = ids.reshape(-1)
-        scene_id, offsets = self.scene_id.cpu()[flat], self.offsets.cpu()
-        involved = scene_id.unique().tolist() or [0]
+        flat = ids.reshape(-1).numpy()
+        wrong = flat[(flat < 0) | (flat >= self.num_states)]
+        if wrong.size:
+            raise SceneError(f"there is no state {wrong[0]}; this set has 0..{self.num_states - 1}")
+        offsets = self.offsets.cpu().numpy()
+        scene_id = np.searchsorted(offsets, flat, side="right") - 1
+        involved = np.unique(scene_id).tolist() or [0]
         first = self.scenes[involved[0]]
-        parts = []
+        result = np.empty((len(flat), *(first.picture_shape or ())), dtype=np.uint8)
         for index in involved:
             scene = self.scenes[index]
-            if scene.has_pictures and scene.picture_shape != first.picture_shape:
+            rows = scene_id == index
+            found = scene.pictures(flat[rows] - offsets[index]).numpy()
+            if scene.picture_shape != first.picture_shape:
                 raise SceneError(
                     f"scenes {first.name!r} and {scene.name!r} have pictures of different sizes"
                     f" ({first.picture_shape}, {scene.picture_shape}); ask scene by scene"
                 )
-            parts.append(scene.pictures(flat[scene_id == index] - offsets[index]))
-        result = torch.cat(parts)
-        # They came scene by scene: back into the order asked for.
-        result = result[torch.argsort(torch.argsort(scene_id, stable=True))]
-        return result.reshape(*ids.shape, *result.shape[1:])
+            result[rows] = found
+        return torch.from_numpy(result).reshape(*ids.shape, *result.shape[1:])
 
     def to(self, device: torch.device | str) -> SceneSet:
         """The same set with its tables on a device; the scenes themselves stay on the CPU."""
@@ -280,6 +282,10 @@ class SceneSet:
 
     def __repr__(self) -> str:
         return f"SceneSet({', '.join(f'{scene.name}: {scene.num_states}' for scene in self.scenes)})"
+
+
+def _joined(arrays: list[np.ndarray]) -> Tensor:
+    return torch.from_numpy(np.concatenate(arrays))
 
 
 def _listed(scenes: Any) -> list[Any]:
