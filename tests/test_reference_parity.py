@@ -13,12 +13,13 @@ import numpy as np
 import pytest
 import torch
 from tensordict import TensorDict
+from tensordict.nn import TensorDictModule
 from torch import Tensor
 from torchrl.objectives import A2CLoss, LossModule
 
 from vusfa.envs import TargetNavEnv
 from vusfa.modules import Agent, make_agent
-from vusfa.objectives import TFRMSprop, USFLoss
+from vusfa.objectives import DualAscent, TFRMSprop, USFEstimator, USFLoss
 from vusfa.objectives.functional import dual_ascent
 from vusfa.scenes import Scene, SceneSet
 
@@ -409,3 +410,134 @@ class TestModels:
             first = arrays[f"{step}_rms_first16"][index]
             close(accumulator[:16], first[~np.isnan(first)], 2e-7)
             close(accumulator.double().norm(), arrays[f"{step}_rms_l2"][index], 2e-7 * size)
+
+
+class TestReturns:
+    """golden_returns: R, R - V and psi's return of 20 stretches, as the released threads computed them."""
+
+    @pytest.fixture
+    def cases(self, golden: Path) -> list[dict[str, Any]]:
+        about = json.loads((golden / "golden_returns.json").read_text())
+        with np.load(golden / "golden_returns.npz") as stored:
+            arrays = dict(stored)
+        cases = []
+        for case in about["cases"]:
+            prefix = f"c{case['case']:02d}_"
+            stretch = {name.removeprefix(prefix): a for name, a in arrays.items() if name.startswith(prefix)}
+            cases.append({**case, "gamma": about["gamma"], "arrays": stretch})
+        assert {case["terminal"] for case in cases} == {True, False}
+        return cases
+
+    def test_every_stretch(self, cases: list[dict[str, Any]]) -> None:
+        """A critic that looks its outputs up: states are numbers, the last one bootstraps."""
+        for case in cases:
+            arrays, steps = case["arrays"], case["length"]
+            tables = {
+                "state_value": np.append(arrays["values"], arrays["bootstrap_v"])[:, None],
+                # psi of the states in between, and phi of the first, have no part in it
+                "successor_features": np.concatenate(
+                    [np.full_like(arrays["phi_next"], np.nan), arrays["bootstrap_usf"][None]]
+                ),
+                "state_embedding": np.concatenate(
+                    [np.full_like(arrays["phi_next"][:1], np.nan), arrays["phi_next"]]
+                ),
+            }
+            critic = TensorDictModule(
+                lambda state, tables=tables: tuple(
+                    torch.from_numpy(t).float()[state] for t in tables.values()
+                ),
+                in_keys=["state"],
+                out_keys=list(tables),
+            )
+            states, done = torch.arange(steps + 1), torch.zeros(steps, 1, dtype=torch.bool)
+            done[-1] = case["terminal"]
+            following = {"state": states[1:], "reward": torch.from_numpy(arrays["rewards"]).float()[:, None]}
+            following |= {"done": done, "terminated": done}
+            stretch = TensorDict({"state": states[:-1], "next": following}, [steps])
+            estimator = USFEstimator(value_network=critic, gamma=case["gamma"])
+            targets = estimator(stretch.clone())
+            close(targets["value_target"], arrays["R"])
+            close(targets["advantage"], arrays["td"])
+            close(targets["value_target"], arrays["R_f64"])
+            if "usf_R" in arrays:
+                close(targets["successor_target"], arrays["usf_R"])
+
+    def test_a_time_limit_is_a_terminal_to_the_released_code(self, golden: Path) -> None:
+        about = json.loads((golden / "golden_returns.json").read_text())
+        expected = about["time_limit_last_segment_r_time_order"]
+        steps = len(expected)
+        critic = TensorDictModule(
+            lambda state: torch.full_like(state, 5.0), in_keys=["state"], out_keys=["state_value"]
+        )
+        cut = torch.zeros(steps, 1, dtype=torch.bool)
+        cut[-1] = True
+        following = {
+            "state": torch.zeros(steps, 1),
+            "reward": torch.full((steps, 1), -0.01),
+            "done": cut,
+            "terminated": torch.zeros_like(cut),
+        }
+        segment = TensorDict({"state": torch.zeros(steps, 1), "next": following}, [steps])
+        estimator = USFEstimator(value_network=critic, gamma=about["gamma"], bootstrap_at_timeout=False)
+        close(estimator(segment)["value_target"], np.array(expected))
+
+
+class TestOptimiser:
+    """golden_optim: six steps of five variables, with clipping, a zero gradient and a rate of zero."""
+
+    @pytest.mark.parametrize("foreach", [False, True])
+    def test_every_step(self, golden: Path, foreach: bool) -> None:
+        about = json.loads((golden / "golden_optim.json").read_text())
+        with np.load(golden / "golden_optim.npz") as stored:
+            arrays = dict(stored)
+        seed, shapes = about["seed"], about["shapes"]
+        variables = [
+            torch.nn.Parameter(
+                torch.from_numpy(
+                    np.random.default_rng([seed, 5000, j]).uniform(-1, 1, shape).astype(np.float32)
+                )
+            )
+            for j, shape in enumerate(shapes)
+        ]
+        optimiser = TFRMSprop(
+            variables,
+            alpha=about["decay"],
+            eps=about["epsilon"],
+            max_grad_norm=about["clip_norm"],
+            foreach=foreach,
+        )
+        clipped = 0
+        for step, lr in enumerate(about["lrs"]):
+            for j, (variable, scale) in enumerate(zip(variables, about["grad_scales"], strict=True)):
+                draw = np.random.default_rng([seed, 5001, step, j]).standard_normal(shapes[j]) * scale
+                variable.grad = torch.from_numpy(draw.astype(np.float32))
+                norm = about["gradient_norms"][step][j]
+                assert variable.grad.norm().item() == pytest.approx(norm, rel=1e-5)
+                clipped += norm > about["clip_norm"]
+            optimiser.param_groups[0]["lr"] = lr
+            optimiser.step()
+            for j, variable in enumerate(variables):
+                close(variable, arrays[f"var_{step + 1}_v{j}"], 1e-6)
+                accumulator = arrays[f"rms_{step + 1}_v{j}"]
+                ours = optimiser.state[variable]["square_avg"]
+                np.testing.assert_allclose(ours.numpy(), accumulator, rtol=2e-6)
+        assert clipped > 0
+
+
+class TestMultiplier:
+    """m4_vusfa's beta_update_cases: the multiplier as the object that training steps."""
+
+    def test_every_case(self, golden: Path) -> None:
+        with np.load(golden / "m4_vusfa.npz") as stored:
+            cases = stored["beta_update_cases"]
+        agent = make_agent("vusfa", "reference", two_scenes(), observation="features")
+        loss = USFLoss(agent.get_policy_operator(), agent.get_value_operator())
+        multiplier = DualAscent(loss, step_size=1e-6)
+        for old, violation, new in cases.tolist():
+            loss.bottleneck_coeff = old
+            loss.last_kl.copy_(loss.information_target + violation)
+            multiplier.step()
+            # the violation is a difference of float32 numbers here
+            assert loss.bottleneck_coeff.item() == pytest.approx(
+                new, rel=1e-6, abs=1e-6 * 1e-6 * (1 + abs(violation))
+            )

@@ -77,13 +77,15 @@ def lambda_return(
     _assert_transitions(cumulant, next_value, done, terminated, time_dim)
     bootstrap = torch.where(terminated, 0.0, next_value)
     cumulants, bootstraps, dones = (x.unbind(time_dim) for x in (cumulant, bootstrap, done))
+    # the whole return, not mixed with estimates that may not even be finite
+    whole = not isinstance(lmbda, Tensor) and lmbda == 1.0
     value = bootstraps[-1]
     returns = []
     for cumulant_t, bootstrap_t, done_t in zip(
         reversed(cumulants), reversed(bootstraps), reversed(dones), strict=True
     ):
         # where the episode ended, the return of the step after it belongs to another episode
-        value = torch.where(done_t, bootstrap_t, torch.lerp(bootstrap_t, value, lmbda))
+        value = torch.where(done_t, bootstrap_t, value if whole else bootstrap_t.lerp(value, lmbda))
         value = cumulant_t + gamma * value
         returns.append(value)
     return torch.stack(returns[::-1], time_dim)

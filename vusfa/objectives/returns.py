@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -22,6 +21,7 @@ from torch import Tensor
 from torchrl.objectives.value import ValueEstimatorBase
 
 from vusfa.objectives.functional import lambda_return, n_step_return
+from vusfa.objectives.keys import EstimatorKeys
 
 __all__ = ["USFEstimator"]
 
@@ -80,38 +80,8 @@ class USFEstimator(ValueEstimatorBase):
     tensor([2.1250, 1.2500, 0.5000])
     """
 
-    @dataclass
-    class _AcceptedKeys(ValueEstimatorBase._AcceptedKeys):
-        """The keys that ``set_keys`` takes, with their defaults.
-
-        Attributes:
-            advantage: where the advantage is written.
-            value_target: where the value's target is written.
-            value: the value, which the critic writes.
-            successor_features: psi, which the critic writes.
-            state_embedding: phi, which the critic writes.
-            successor_target: where psi's target is written.
-            reward: under ``"next"``.
-            done: under ``"next"``.
-            terminated: under ``"next"``.
-            steps_to_next_obs: of TorchRL's estimators; not read here.
-            sample_log_prob: of TorchRL's estimators; not read here.
-        """
-
-        # TorchRL looks keys up in this very class, so that those of its parent are repeated
-        advantage: NestedKey = "advantage"
-        value_target: NestedKey = "value_target"
-        value: NestedKey = "state_value"
-        successor_features: NestedKey = "successor_features"
-        state_embedding: NestedKey = "state_embedding"
-        successor_target: NestedKey = "successor_target"
-        reward: NestedKey = "reward"
-        done: NestedKey = "done"
-        terminated: NestedKey = "terminated"
-        steps_to_next_obs: NestedKey = "steps_to_next_obs"
-        sample_log_prob: NestedKey | None = None
-
-    default_keys = _AcceptedKeys
+    _AcceptedKeys = EstimatorKeys
+    default_keys = EstimatorKeys
 
     def __init__(
         self,

@@ -3,7 +3,7 @@ r"""The loss of universal successor features approximators, with or without a va
 from __future__ import annotations
 
 import contextlib
-from dataclasses import dataclass, fields
+from dataclasses import fields
 from typing import Any, Literal, NamedTuple
 
 import torch
@@ -11,7 +11,6 @@ from tensordict import TensorDict, TensorDictBase, TensorDictParams
 from tensordict.nn import (
     ProbabilisticTensorDictSequential,
     TensorDictModule,
-    composite_lp_aggregate,
     dispatch,
 )
 from tensordict.utils import NestedKey, unravel_key
@@ -28,6 +27,7 @@ from vusfa.objectives.functional import (
     policy_gradient_loss,
     successor_loss,
 )
+from vusfa.objectives.keys import LossKeys
 from vusfa.objectives.returns import USFEstimator
 from vusfa.objectives.single_pass import Memory, run_actor, run_critic, select_inputs
 
@@ -94,6 +94,9 @@ class USFLoss(LossModule):
             What only successor features and the bottleneck train must then not be shared. Needs
             ``functional=True``.
 
+    Each term is a method as well. It takes steps with their targets and returns their weighted terms;
+    ``results`` are those of the networks on these steps, which it runs when there are none.
+
     Coefficients and ``information_target`` are buffers: saved in the ``state_dict``, moved by ``to``, set by
     assignment.
 
@@ -131,52 +134,9 @@ class USFLoss(LossModule):
     >>> loss = loss.make_value_estimator(ValueEstimators.GAE, gamma=0.99, lmbda=0.95)
     """
 
-    @dataclass
-    class _AcceptedKeys:
-        """The keys that ``set_keys`` takes, with their defaults; those of the estimator are passed on to it.
-
-        Attributes:
-            advantage: the advantage, computed when absent.
-            value_target: the value's target.
-            value: the value, which the critic writes.
-            successor_features: psi, which the critic writes.
-            successor_target: psi's target.
-            state_embedding: phi, which the critic writes.
-            state_loc: mean of the state's latent, which the critic writes.
-            state_scale: its scale.
-            goal_loc: mean of the goal's latent, which the critic writes.
-            goal_scale: its scale.
-            action: the action taken, or a list of keys for a composite action.
-            reward: under ``"next"``.
-            done: under ``"next"``.
-            terminated: under ``"next"``.
-            sample_log_prob: log-probability of the action when it was taken, for estimators that correct for
-                its age.
-        """
-
-        advantage: NestedKey = "advantage"
-        value_target: NestedKey = "value_target"
-        value: NestedKey = "state_value"
-        successor_features: NestedKey = "successor_features"
-        successor_target: NestedKey = "successor_target"
-        state_embedding: NestedKey = "state_embedding"
-        state_loc: NestedKey = "state_loc"
-        state_scale: NestedKey = "state_scale"
-        goal_loc: NestedKey = "goal_loc"
-        goal_scale: NestedKey = "goal_scale"
-        action: NestedKey | list[NestedKey] = "action"
-        reward: NestedKey = "reward"
-        done: NestedKey = "done"
-        terminated: NestedKey = "terminated"
-        sample_log_prob: NestedKey | list[NestedKey] | None = None
-
-        def __post_init__(self) -> None:
-            if self.sample_log_prob is None:
-                aggregate = composite_lp_aggregate(nowarn=True)
-                self.sample_log_prob = "sample_log_prob" if aggregate else "action_log_prob"
-
-    default_keys = _AcceptedKeys
-    tensor_keys: _AcceptedKeys
+    _AcceptedKeys = LossKeys
+    default_keys = LossKeys
+    tensor_keys: LossKeys
     default_value_estimator = ValueEstimators.TD1
     SUPPORTED_VALUE_ESTIMATORS = tuple(LAMBDAS)
     _schedulable_buffers = frozenset({*COEFFICIENTS, "information_target"})
@@ -292,14 +252,18 @@ class USFLoss(LossModule):
         """What ``forward`` returns, in this order when called without a tensordict."""
         if self._out_keys is not None:
             return self._out_keys
-        groups = [
-            (self.objective_coeff is not None, ["loss_objective"]),
-            (self.has_critic, ["loss_critic", "explained_variance"]),
-            (self.entropy_coeff is not None, ["entropy", "loss_entropy"]),
-            (self.has_successor, ["loss_successor"]),
-            (self.has_bottleneck, ["loss_bottleneck", "kl", "beta"]),
-        ]
-        return [key for present, keys in groups if present for key in keys]
+        present = {
+            "loss_objective": self.objective_coeff is not None,
+            "loss_critic": self.has_critic,
+            "loss_entropy": self.entropy_coeff is not None,
+            "loss_successor": self.has_successor,
+            "loss_bottleneck": self.has_bottleneck,
+            "entropy": self.entropy_coeff is not None,
+            "explained_variance": self.has_critic,
+            "kl": self.has_bottleneck,
+            "beta": self.has_bottleneck,
+        }
+        return [key for key, is_present in present.items() if is_present]
 
     @out_keys.setter
     def out_keys(self, value: list[NestedKey] | None) -> None:
@@ -322,7 +286,8 @@ class USFLoss(LossModule):
         """
         tensordict = tensordict.clone(False)
         if tensordict.get(self.tensor_keys.advantage, None) is None:
-            params = self.critic_network_params.detach() if self.critic_network_params is not None else None
+            params = self.critic_network_params
+            params = params if params is None else params.detach()
             self.value_estimator(tensordict, params=params, target_params=params)
         results = self._evaluate(tensordict)
         out = TensorDict({}, batch_size=[])
@@ -348,64 +313,34 @@ class USFLoss(LossModule):
         return out
 
     def loss_objective(self, tensordict: TensorDictBase, results: Results | None = None) -> Tensor:
-        """The policy's term, ``-c_pi log pi(a) A``.
-
-        Args:
-            tensordict: steps with their advantage, ``(*batch,)``.
-            results: of the networks on these steps; run here, when ``None``.
-
-        Returns:
-            ``(*batch,)``, not reduced.
-        """
+        """The policy's term, ``-c_pi log pi(a) A``, ``(*batch,)``; reads action and advantage."""
         dist = (results or self._evaluate(tensordict)).distribution
         log_prob = action_log_prob(dist, tensordict, self.tensor_keys.action)
         advantage = self._target(tensordict, "advantage")
-        return self.objective_coeff * policy_gradient_loss(log_prob, _per_step(advantage, log_prob))
-
-    def loss_entropy(
-        self, tensordict: TensorDictBase, results: Results | None = None
-    ) -> tuple[Tensor, Tensor]:
-        """The entropy bonus, ``-c_H H``, and the entropy.
-
-        Args:
-            tensordict: steps, ``(*batch,)``.
-            results: of the networks on these steps; run here, when ``None``.
-
-        Returns:
-            two tensors ``(*batch,)``, not reduced.
-        """
-        entropy = action_entropy((results or self._evaluate(tensordict)).distribution)
-        return -self.entropy_coeff * entropy, entropy.detach()
+        if advantage.ndim > log_prob.ndim:
+            advantage = advantage.squeeze(-1)
+        return self.objective_coeff * policy_gradient_loss(log_prob, advantage)
 
     def loss_critic(
         self, tensordict: TensorDictBase, results: Results | None = None
     ) -> tuple[Tensor, Tensor]:
-        """The value's term, ``c_V (G - V)^2`` for l2, and how much of the targets' variance the value
-        explains.
-
-        Args:
-            tensordict: steps with their value target, ``(*batch,)``.
-            results: of the networks on these steps; run here, when ``None``.
-
-        Returns:
-            ``(*batch,)``, not reduced, and a scalar.
-        """
+        """The value's term, ``c_V (G - V)^2`` for l2, ``(*batch,)``, and the variance that V explains."""
         target = self._target(tensordict, "value_target").detach()
         value = (results or self._evaluate(tensordict)).written.get(self.tensor_keys.value).to(target.dtype)
-        mask = self._valid(tensordict, target)
-        distance = distance_loss(target, value, loss_function=self.loss_critic_type)
-        return self.critic_coeff * distance.squeeze(-1), explained_variance(target, value, mask)
+        distance = distance_loss(target, value, loss_function=self.loss_critic_type).squeeze(-1)
+        return self.critic_coeff * distance, explained_variance(
+            target, value, self._valid(tensordict, target)
+        )
+
+    def loss_entropy(
+        self, tensordict: TensorDictBase, results: Results | None = None
+    ) -> tuple[Tensor, Tensor]:
+        """The entropy bonus, ``-c_H H``, and the entropy H, both ``(*batch,)``."""
+        entropy = action_entropy((results or self._evaluate(tensordict)).distribution)
+        return -self.entropy_coeff * entropy, entropy.detach()
 
     def loss_successor(self, tensordict: TensorDictBase, results: Results | None = None) -> Tensor:
-        """The successor features' term, ``c_psi`` times the mean squared error over features.
-
-        Args:
-            tensordict: steps with their successor target, ``(*batch,)``.
-            results: of the networks on these steps; run here, when ``None``.
-
-        Returns:
-            ``(*batch,)``, not reduced.
-        """
+        """The successor features' term, ``c_psi`` times the mean over features of (target - psi)^2."""
         target = self._target(tensordict, "successor_target")
         written = (results or self._evaluate(tensordict)).written
         successor = written.get(self.tensor_keys.successor_features).to(target.dtype)
@@ -414,15 +349,7 @@ class USFLoss(LossModule):
     def loss_bottleneck(
         self, tensordict: TensorDictBase, results: Results | None = None
     ) -> tuple[Tensor, Tensor]:
-        """The information constraint's term, ``beta (KL - I_c)``, and KL.
-
-        Args:
-            tensordict: steps, ``(*batch,)``.
-            results: of the networks on these steps; run here, when ``None``.
-
-        Returns:
-            two tensors ``(*batch,)``, not reduced.
-        """
+        """The information constraint's term, ``beta (KL - I_c)``, and KL, both ``(*batch,)``."""
         written = (results or self._evaluate(tensordict)).written
         divergences = [gaussian_kl(written.get(loc), written.get(scale)) for loc, scale in self._branches()]
         kl = torch.stack(divergences).mean(0)
@@ -504,7 +431,7 @@ class USFLoss(LossModule):
         if target is None:
             raise KeyError(
                 f"the input has no {key!r}. All targets are computed where the advantage "
-                f"({self.tensor_keys.advantage!r}) is absent; beforehand, compute them by loss.value_estimator"
+                f"({self.tensor_keys.advantage!r}) is absent; else, compute them with loss.value_estimator"
             )
         return target
 
@@ -518,10 +445,6 @@ class USFLoss(LossModule):
         masks = [tensordict.get(key, None) for key in self._loss_mask_keys()]
         expanded = [self._expand_loss_mask(mask, like) for mask in masks if mask is not None]
         return torch.stack(expanded).all(0) if expanded else None
-
-
-def _per_step(values: Tensor, like: Tensor) -> Tensor:
-    return values.squeeze(-1) if values.ndim > like.ndim else values
 
 
 def _check_choice(name: str, value: str, choices: tuple[str, ...]) -> None:
