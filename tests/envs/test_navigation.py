@@ -348,21 +348,32 @@ def test_moving_to_the_device_it_is_on(scenes: SceneSet) -> None:
     assert env.reset().device == torch.device("cpu")
 
 
-def test_moving_moves_tables_specs_and_generator(scenes: SceneSet) -> None:
-    """No other device is here to be sure of: the meta device has tables, but no numbers and no generator."""
+def test_a_move_reaches_every_table(scenes: SceneSet) -> None:
+    """There may be no second device here; every move of a module comes down to a function of its tensors."""
     env = TargetNavEnv(scenes, "all", [3], seed=0)
-    doubled = env._world._replace(distance=env._world.distance.clone())
-    env._world = doubled
-    seen: list[torch.Tensor] = []
+    before = [id(table) for table in _tables(env._world)]
+    env._apply(torch.clone)
+    after = _tables(env._world)
+    assert len(before) == len(after) >= 20
+    assert not set(before) & {id(table) for table in after}
+    env.rollout(5)
 
-    def spy(tensor: torch.Tensor) -> torch.Tensor:
-        seen.append(tensor)
-        return tensor.clone()
 
-    env._apply(spy)
-    assert len(seen) >= 18
-    assert env._world.successor is not scenes.successor
-    assert torch.equal(env._world.successor, scenes.successor)
+def _tables(world: Any) -> list[torch.Tensor]:
+    if isinstance(world, torch.Tensor):
+        return [world]
+    return [] if world is None else [table for entry in world for table in _tables(entry)]
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a second device")
+def test_on_a_gpu(scenes: SceneSet) -> None:
+    env = TargetNavEnv(scenes, "all", [64], max_steps=4, goal_sampling="episode", seed=0).to("cuda")
+    data = env.rollout(20, break_when_any_done=False)
+    assert data.device.type == "cuda"
+    moved = scenes.to("cuda").successor[data["state_id"][..., -1], data["action"]]
+    assert torch.equal(data["next", "state_id"][..., -1], moved)
+    assert env.set_state(0, 2)["shortest_path"].device.type == "cuda"
+    assert env.to("cpu").rollout(5).device.type == "cpu"
 
 
 @pytest.mark.parametrize(

@@ -63,14 +63,19 @@ def test_without_a_tensordict_it_shows_what_came_last(seen: SceneSet) -> None:
 
 
 def test_after_a_partial_reset_it_shows_both_halves(seen: SceneSet) -> None:
-    env = TransformedEnv(TargetNavEnv(seen, "all", batch_size=[2], seed=0))
+    env = TransformedEnv(TargetNavEnv(seen, "all", batch_size=[2], goal_sampling="episode", seed=0))
     data = env.reset()
+    goals = data["goal_id"].clone()
     data["action"] = torch.tensor([1, 1])
     data = env.step(data)["next"].exclude("reward")
     data["_reset"] = torch.tensor([[True], [False]])
     data = env.reset(data, set_state=False)
+    assert data["goal_id"][0] != goals[0], "the draw of this seed; another would do"
     for row in range(2):
         assert np.array_equal(env.render(row=row), seen.pictures(data["state_id"][row, -1]).numpy())
+        assert np.array_equal(
+            env.render(row=row, panels=["goal"]), seen.pictures(data["goal_id"][row]).numpy()
+        )
 
 
 def test_torchrls_own_recorder_can_use_it(seen: SceneSet) -> None:

@@ -105,7 +105,8 @@ def draw_map(scene: Scene, trail: Sequence[int], goal: int, size: int = _HEIGHT)
         )
     path = [pixel(scene.location[state]) for state in trail]
     draw.line(path, fill=_TRAIL, width=max(_SMOOTH, int(half / 3)), joint="curve")
-    for state, colour, length in ((goal, _GOAL, half), (trail[-1], _AGENT, half * 0.8)):
+    dart = max(half * 0.9, side * 0.04)  # to be seen in large rooms, too
+    for state, colour, length in ((goal, _GOAL, dart), (trail[-1], _AGENT, dart * 0.9)):
         draw.polygon(_arrow(pixel(scene.location[state]), float(scene.rotation[state]), length), fill=colour)
     return np.asarray(image.resize((size, size), Image.Resampling.LANCZOS))
 
