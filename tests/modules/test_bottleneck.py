@@ -35,8 +35,10 @@ class TestGaussianEncoder:
     @pytest.mark.parametrize("initial_scale", [0.05, 0.5, 2.0])
     def test_scales_start_where_asked(self, scenes: SceneSet, initial_scale: float) -> None:
         module = gaussian(scenes, initial_scale=initial_scale)
-        scale = module(torch.randint(21, (30, 4)), torch.randint(21, (30,)))[3]
+        inputs = torch.randint(21, (30, 4)), torch.randint(21, (30,))
+        _, _, loc, scale, *_ = module(*inputs)
         assert scale.median().item() == pytest.approx(initial_scale, rel=0.25)
+        assert torch.equal(loc, gaussian(scenes)(*inputs)[2])  # the means are left alone
 
     @pytest.mark.parametrize(
         ("options", "message"),

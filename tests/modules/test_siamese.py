@@ -9,6 +9,7 @@ from torch.utils.flop_counter import FlopCounterMode
 
 from vusfa.errors import ConfigError
 from vusfa.modules import FeatureFrames, NormalisedEncoder, SiameseEncoder, frozen
+from vusfa.modules.siamese import Branch
 from vusfa.scenes import SceneSet
 
 QUIRKS: list[dict[str, Any]] = [{}, {"shared": False}, {"state_layer": True}, {"out_features": None}]
@@ -116,6 +117,17 @@ class TestSharing:
         state, goal = encoder(scenes, **quirk)(torch.full((4,), 5), torch.tensor(5))
         assert (state - goal).abs().max() > 0.01
 
+    def test_the_states_own_layer_by_hand(self) -> None:
+        """max(0, first) through weight -1 and bias 3, max(0, .), then times 10: 2 becomes 10, 5 becomes 0."""
+        branch, extra = Branch(1, 1, 1, 1), torch.nn.Linear(1, 1)
+        with torch.no_grad():
+            for layer, weight, bias in ((extra, -1.0, 3.0), (branch.last, 10.0, 0.0)):
+                layer.weight.fill_(weight)
+                layer.bias.fill_(bias)
+        first = torch.tensor([[2.0], [5.0], [-4.0]])
+        assert branch.finish(first, extra).tolist() == [[10.0], [0.0], [30.0]]
+        assert branch.finish(first).tolist() == [[20.0], [50.0], [0.0]]
+
     def test_both_branches_train_the_same_weights(self, scenes: SceneSet) -> None:
         module = encoder(scenes)
         for which in (0, 1):
@@ -196,9 +208,9 @@ class TestFrozen:
         with pytest.raises(KeyError), frozen(module):
             raise KeyError
         with torch.no_grad():
-            before = module(*inputs)[0]
+            before = module(*inputs)[1]
             module.branch.last.bias.add_(1.0)
-            torch.testing.assert_close(module(*inputs)[0], before + 1.0)
+            torch.testing.assert_close(module(*inputs)[1], before + 1.0)
 
     def test_gradients_are_of_the_weights_as_they_are(self, scenes: SceneSet) -> None:
         module = encoder(scenes)

@@ -27,6 +27,9 @@ class SceneLinear(nn.Module):
     rows; small outputs (the logits) are computed for all scenes and picked, which is cheaper than sorting.
     With one scene it is a plain ``linear``.
 
+    All scenes' weights are one parameter. An optimiser that clips or adapts by parameter sees them together,
+    where the released code has a variable a scene; it matters only for gradients beyond the clipping norm.
+
     Args:
         num_scenes: n.
         in_features: size of an input row.
