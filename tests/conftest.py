@@ -5,11 +5,12 @@ from __future__ import annotations
 import itertools
 import os
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
 import torch
+import torch.multiprocessing
 
 from vusfa.scenes import Scene
 
@@ -82,3 +83,13 @@ def scene_file(tmp_path: Path) -> Path:
     path = tmp_path / "hall.h5"
     scene.save(path, pictures)
     return path
+
+
+@pytest.fixture
+def fast_workers() -> Iterator[None]:
+    """Workers are forked from a server that has imported everything, instead of importing it each."""
+    before = torch.multiprocessing.get_start_method(allow_none=True)
+    torch.multiprocessing.set_forkserver_preload(["vusfa.training"])
+    torch.multiprocessing.set_start_method("forkserver", force=True)
+    yield
+    torch.multiprocessing.set_start_method(before, force=True)

@@ -101,7 +101,9 @@ def draw_film(scenes: SceneSet, trail: Sequence[int], goal: int, scale: int = 2)
     [(1132, 322), (1132, 322)]
     """
     scene = scenes.scenes[int(scenes.scene_id[goal])]
-    panels = {"view": "what it sees", "goal": "what it looks for", "map": ""} if scene.has_pictures else {"map": ""}
+    panels = {"map": ""}
+    if scene.has_pictures:
+        panels = {"view": "what it sees", "goal": "what it looks for", **panels}
     shortest = int(scenes.distance(trail[0], goal))
     film = []
     for step in range(len(trail)):

@@ -56,20 +56,16 @@ def launch(job: Callable[[DictConfig, list[str]], int], folder: Path, name: str)
 
     def guarded(cfg: DictConfig) -> None:
         # Errors are reported in here: one that passed through Hydra would get lines of Hydra's around it.
-        codes.append(
-            _report(lambda: job(_settled(cfg, folder, name), list(HydraConfig.get().overrides.task)))
-        )
+        # As typed: one with an interpolation would be resolved by being looked at.
+        overrides: Any = OmegaConf.to_container(HydraConfig.get().overrides.task, resolve=False)
+        codes.append(_report(lambda: job(_settled(cfg, folder, name), overrides), folder, name))
 
     def run() -> int:
         sys.argv[1:] = with_saved_overrides(sys.argv[1:])
         hydra.main(version_base="1.3", config_path=str(folder.resolve()), config_name=name)(guarded)()
         return max(codes, default=0)  # a sweep has several; --help none
 
-    try:
-        code = _report(run)
-    except (HydraException, OmegaConfBaseException) as error:
-        code = _complain(explain(error, folder, name))
-    sys.exit(code)
+    sys.exit(_report(run, folder, name))
 
 
 def compose(folder: Path, name: str, overrides: Sequence[str] = ()) -> DictConfig:
@@ -101,11 +97,10 @@ def with_saved_overrides(arguments: Sequence[str]) -> list[str]:
     paths = [argument.partition("=")[2] for argument in arguments if argument.startswith("resume=")]
     if not paths or paths[-1] in ("", "null"):
         return list(arguments)
-    given = {argument.partition("=")[0].lstrip("+~") for argument in arguments}
+    given = {"folder", *(argument.partition("=")[0].lstrip("+~") for argument in arguments)}
     saved = load_checkpoint(paths[-1]).get("overrides", [])
     kept = [override for override in saved if override.partition("=")[0].lstrip("+~") not in given]
-    folder = [] if "folder" in given else [f"folder='{Path(paths[-1]).resolve().parent}'"]
-    return [*kept, *folder, *arguments]
+    return [*kept, f"folder='{Path(paths[-1]).resolve().parent}'", *arguments]
 
 
 def check_types(cfg: Mapping[str, Any], defaults: Mapping[str, Any]) -> None:
@@ -173,11 +168,13 @@ def _settled(cfg: DictConfig, folder: Path, name: str) -> DictConfig:
     return cfg
 
 
-def _report(job: Callable[[], int]) -> int:
+def _report(job: Callable[[], int], folder: Path, name: str) -> int:
     try:
         return job()
     except VusfaError as error:
         return _complain(str(error))
+    except (HydraException, OmegaConfBaseException) as error:
+        return _complain(explain(error, folder, name))
     except KeyboardInterrupt:
         return _complain("interrupted before the first update; nothing was written", INTERRUPTED)
 

@@ -35,6 +35,7 @@ class ProgressLine:
     ) -> None:
         from rich.console import Console
         from rich.live import Live
+        from rich.text import Text
 
         self._total = total
         self._console = console or Console(stderr=True)
@@ -46,7 +47,9 @@ class ProgressLine:
         self._line = ""
         self._live: Live | None = None
         if self._console.is_terminal:
-            self._live = Live(console=self._console, get_renderable=lambda: self._line, refresh_per_second=4)
+            self._live = Live(
+                console=self._console, get_renderable=lambda: Text(self._line), refresh_per_second=4
+            )
             self._live.start()
 
     def rates(self, success: float, length_ratio: float) -> None:

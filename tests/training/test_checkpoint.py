@@ -1,0 +1,103 @@
+"""Checkpoints: whole or refused; what they hold comes back."""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from vusfa.errors import CheckpointError
+from vusfa.scenes import Scene, SceneSet
+from vusfa.training.checkpoint import (
+    check_scenes,
+    load_checkpoint,
+    random_state,
+    restore_random_state,
+    save_checkpoint,
+)
+
+STATE = {
+    "agent_config": {},
+    "agent": {"w": torch.arange(500)},
+    "scenes": {},
+    "goals": torch.tensor([1]),
+    "frames": 7,
+}
+
+
+def test_what_is_saved_comes_back(tmp_path: Path):
+    found = load_checkpoint(save_checkpoint(tmp_path / "run" / "a.pt", {**STATE, "rng": random_state()}))
+    assert torch.equal(found["agent"]["w"], STATE["agent"]["w"])
+    assert found["frames"] == 7
+    assert [path.name for path in (tmp_path / "run").iterdir()] == ["a.pt"]
+
+
+@pytest.mark.parametrize("kept", [0.0, 0.3, 0.7, 0.99])
+def test_a_truncated_file_is_named(tmp_path: Path, kept: float):
+    path = save_checkpoint(tmp_path / "a.pt", STATE)
+    content = path.read_bytes()
+    path.write_bytes(content[: int(kept * len(content))])
+    with pytest.raises(CheckpointError, match=r"a\.pt: not a whole checkpoint \(\d+ bytes\)"):
+        load_checkpoint(path)
+
+
+def test_other_files_are_refused(tmp_path: Path):
+    with pytest.raises(CheckpointError, match="no such checkpoint"):
+        load_checkpoint(tmp_path / "none.pt")
+    text = tmp_path / "notes.pt"
+    text.write_text("not a checkpoint at all")
+    with pytest.raises(CheckpointError, match="not a whole checkpoint"):
+        load_checkpoint(text)
+    torch.save({"weights": torch.zeros(3)}, tmp_path / "other.pt")
+    with pytest.raises(CheckpointError, match="'agent_config' is missing"):
+        load_checkpoint(tmp_path / "other.pt")
+    torch.save([1], tmp_path / "list.pt")
+    with pytest.raises(CheckpointError, match="no checkpoint of vusfa"):
+        load_checkpoint(tmp_path / "list.pt")
+    torch.save({**STATE, "format": 99}, tmp_path / "new.pt")
+    with pytest.raises(CheckpointError, match="format 99"):
+        load_checkpoint(tmp_path / "new.pt")
+
+
+def test_no_code_is_run(tmp_path: Path):
+    class Trap:
+        def __reduce__(self):
+            return (Path.touch, (tmp_path / "sprung",))
+
+    torch.save({**STATE, "format": 1, "config": Trap()}, tmp_path / "a.pt")
+    with pytest.raises(CheckpointError):
+        load_checkpoint(tmp_path / "a.pt")
+    assert not (tmp_path / "sprung").exists()
+
+
+def test_a_failed_save_keeps_the_old_one(tmp_path: Path):
+    path = save_checkpoint(tmp_path / "a.pt", STATE)
+    with pytest.raises(Exception, match="pickle"):
+        save_checkpoint(path, {**STATE, "config": lambda: None})
+    assert load_checkpoint(path)["frames"] == 7
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_scenes_must_be_the_same(make_scene: Callable[..., Scene]):
+    rooms = SceneSet([make_scene("hall")])
+    saved = {"names": ["hall"], "fingerprint": rooms.fingerprint}
+    check_scenes("a.pt", saved, rooms)
+    with pytest.raises(CheckpointError, match="trained in hall, not in attic"):
+        check_scenes("a.pt", saved, SceneSet([make_scene("attic")]))
+    with pytest.raises(CheckpointError, match="have changed since"):
+        check_scenes("a.pt", saved, SceneSet([make_scene("hall", features=9)]))
+
+
+def test_random_states_come_back(tmp_path: Path):
+    torch.manual_seed(3)
+    np.random.default_rng()
+    random.gauss(0, 1)  # leaves a second number in store
+    path = save_checkpoint(tmp_path / "a.pt", {**STATE, "rng": random_state()})
+    drawn = torch.rand(3).tolist(), np.random.rand(3).tolist(), [random.gauss(0, 1) for _ in range(3)]  # noqa: NPY002
+    restore_random_state(load_checkpoint(path)["rng"])
+    again = torch.rand(3).tolist(), np.random.rand(3).tolist(), [random.gauss(0, 1) for _ in range(3)]  # noqa: NPY002
+    assert drawn == again

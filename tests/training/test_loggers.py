@@ -1,0 +1,141 @@
+"""What loggers leave on disk."""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+import os
+from pathlib import Path
+
+import pytest
+
+from vusfa.errors import ConfigError
+from vusfa.training import make_loggers
+from vusfa.training.loggers import CSVLogger, TensorBoardLogger, WandbLogger
+
+CONFIG = {"agent": {"model": "vusfa"}, "seed": 3}
+TABLE = [{"scene": "hall", "success": 0.5}, {"scene": "attic", "success": math.nan}]
+
+
+def rows(path: Path) -> list[dict[str, str]]:
+    with open(path, newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def test_csv(tmp_path: Path):
+    with make_loggers(["csv"], tmp_path / "run", CONFIG, run_id="a") as log:
+        assert not (tmp_path / "run").exists()  # a training that cannot begin leaves nothing
+        log.log_metrics({"success": math.nan, "loss": 2.0}, 10)
+        log.log_metrics({"success": 0.5, "loss": 1.0}, 20)
+        log.log_checkpoint(tmp_path / "run" / "checkpoint.pt", 20)
+        log.log_table("evaluation", TABLE, 20)
+    assert rows(tmp_path / "run" / "metrics.csv") == [
+        {"frames": "10", "success": "", "loss": "2.0"},
+        {"frames": "20", "success": "0.5", "loss": "1.0"},
+    ]
+    assert json.loads((tmp_path / "run" / "config.json").read_text()) == CONFIG
+    assert rows(tmp_path / "run" / "evaluation.csv")[1] == {"scene": "attic", "success": ""}
+
+
+def test_csv_takes_out_what_came_after_the_checkpoint(tmp_path: Path):
+    log = CSVLogger(tmp_path, CONFIG)
+    for frames in (10, 20, 30):
+        log.log_metrics({"loss": frames / 10, "kl": 0.0}, frames)
+    with open(tmp_path / "metrics.csv", "a") as file:
+        file.write("40,4.")  # the process died here
+    resumed = CSVLogger(tmp_path, CONFIG, resume_frames=20)
+    resumed.log_metrics({"kl": 0.0, "loss": 9.0}, 30)
+    assert [(row["frames"], row["loss"]) for row in rows(tmp_path / "metrics.csv")] == [
+        ("10", "1.0"),
+        ("20", "2.0"),
+        ("30", "9.0"),
+    ]
+
+
+def test_a_new_csv_run_begins_a_new_file(tmp_path: Path):
+    for loss in (1.0, 2.0):
+        CSVLogger(tmp_path, CONFIG).log_metrics({"loss": loss}, 10)
+    assert [row["loss"] for row in rows(tmp_path / "metrics.csv")] == ["2.0"]
+
+
+def test_csv_refuses_a_column_that_it_does_not_have(tmp_path: Path):
+    log = CSVLogger(tmp_path, CONFIG)
+    log.log_metrics({"loss": 1.0}, 10)
+    with pytest.raises(ValueError, match="'kl'"):
+        log.log_metrics({"kl": 1.0}, 20)
+
+
+@pytest.mark.filterwarnings("default")  # TensorBoard's own imports warn
+def test_tensorboard(tmp_path: Path):
+    log = TensorBoardLogger(tmp_path, CONFIG)
+    log.log_metrics({"goal/hall/3/success": 0.25, "loss": math.nan}, 10)
+    log.log_checkpoint(tmp_path / "checkpoint.pt", 10)
+    log.log_table("evaluation", TABLE, 10)
+    log.close()
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    events = EventAccumulator(str(tmp_path))
+    events.Reload()
+    assert events.Tags()["scalars"] == ["goal/hall/3/success"]
+    assert [(e.step, e.value) for e in events.Scalars("goal/hall/3/success")] == [(10, 0.25)]
+    texts = {
+        tag: events.Tensors(tag)[0].tensor_proto.string_val[0].decode() for tag in events.Tags()["tensors"]
+    }
+    assert "| agent.model | vusfa |" in texts["config/text_summary"]
+    assert "| hall | 0.5 |" in texts["evaluation/text_summary"]
+    assert texts["checkpoint/text_summary"].endswith("checkpoint.pt")
+
+
+@pytest.mark.filterwarnings("default")  # wandb's own
+def test_wandb_offline(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setenv("HOME", str(tmp_path / "home"))
+    monkeypatch.delenv("WANDB_DATA_DIR", raising=False)
+    checkpoint = tmp_path / "checkpoint.pt"
+    checkpoint.write_bytes(b"weights")
+    log = WandbLogger(tmp_path / "run", CONFIG, run_id="abc12345", project="test", mode="offline")
+    log.log_metrics({"success": 0.5, "loss": math.nan, "goal/hall/3/success": 0.25}, 10)
+    log.log_checkpoint(checkpoint, 10)
+    log.log_table("evaluation", TABLE, 10)
+    summary = dict(log.run.summary)
+    assert summary["success"] == 0.5
+    assert summary["goal/hall/3/success"] == 0.25
+    assert summary["frames"] == 10
+    assert "loss" not in summary
+    assert log.run.config["agent"] == {"model": "vusfa"}
+    assert log.run.id == "abc12345"
+    log.close()
+    (stored,) = (tmp_path / "run" / "wandb").glob("offline-run-*/run-abc12345.wandb")
+    content = stored.read_bytes()
+    for word in (b"checkpoint-abc12345", b"evaluation", b"goal/hall/3/success"):
+        assert word in content
+    monkeypatch.delenv("WANDB_DATA_DIR", raising=False)
+    os.environ.pop("WANDB_DATA_DIR", None)
+
+
+def test_an_unknown_logger_is_named(tmp_path: Path):
+    with pytest.raises(ConfigError, match="'wandbb'; it may hold csv, tensorboard, wandb"):
+        make_loggers(["csv", "wandbb"], tmp_path / "run", CONFIG, run_id="a")
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_missing_library_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setitem(__import__("sys").modules, "wandb", None)
+    with pytest.raises(ConfigError, match="wandb needs wandb; pip install"):
+        make_loggers(["wandb"], tmp_path / "run", CONFIG, run_id="a")
+
+
+def test_an_exception_closes_loggers_with_a_failure():
+    codes = []
+
+    class Recorder:
+        def close(self, exit_code: int = 0) -> None:
+            codes.append(exit_code)
+
+    from vusfa.training.loggers import Loggers
+
+    with Loggers([Recorder()]) as log:
+        log.exit_code = 143
+    with pytest.raises(RuntimeError, match="lost"), Loggers([Recorder()]):
+        raise RuntimeError("lost")
+    assert codes == [143, 1]

@@ -1,0 +1,65 @@
+"""The progress line, on a terminal and off it."""
+
+from __future__ import annotations
+
+import io
+import math
+
+from rich.console import Console
+
+from vusfa.training import ProgressLine
+from vusfa.training.progress import describe
+
+
+class Clock:
+    now = 0.0
+
+    def __call__(self) -> float:
+        return self.now
+
+
+def test_what_is_not_known_is_left_out():
+    assert describe(5, 10, math.nan, math.nan, math.nan) == "5 of 10 frames"
+    assert describe(0, 36_000, 2.0, 0.5, math.nan).endswith("| 2 a second | success 50.0 % | 5:00:00 to go")
+    assert describe(12, 10, 2.0, 0.5, math.nan).endswith("0:00 to go")
+
+
+def test_a_file_gets_a_line_now_and_then():
+    page, clock = io.StringIO(), Clock()
+    line = ProgressLine(1000, Console(file=page, width=60), every=10.0, clock=clock)
+    with line:
+        for second in range(25):
+            clock.now = float(second)
+            line.update(second * 4)
+            if second == 5:
+                line.rates(0.25, 3.0)
+                line.rates(math.nan, math.nan)
+    lines = page.getvalue().splitlines()
+    assert [text.split()[0] for text in lines] == ["0", "40", "80", "96"]
+    assert (
+        lines[1] == "40 of 1,000 frames | 4 a second | success 25.0 % | length / shortest 3.00 | 4:00 to go"
+    )
+
+
+def test_a_terminal_keeps_one_line():
+    page = io.StringIO()
+    console = Console(file=page, width=120, force_terminal=True)
+    with ProgressLine(100, console) as line:
+        line.update(50)
+        line.rates(1.0, 1.25)
+        line.update(100)
+    text = page.getvalue()
+    assert "100 of 100 frames" in text
+    assert "success 100.0 % | length / shortest 1.25" in text
+    assert text.count("\n") <= 2
+
+
+def test_the_rate_is_that_of_the_last_half_minute():
+    page, clock = io.StringIO(), Clock()
+    line = ProgressLine(10**6, Console(file=page, width=200), every=1.0, clock=clock)
+    frames = 0
+    for second in range(100):
+        clock.now = float(second)
+        frames += 1000 if second < 50 else 10
+        line.update(frames)
+    assert " 10 a second" in page.getvalue().splitlines()[-1]
