@@ -9,32 +9,21 @@ a single one reset with seed s + i.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from os import PathLike
 from typing import Any, ClassVar
 
 import gymnasium
 import numpy as np
-import torch
-from gymnasium import spaces
 from gymnasium.utils import seeding
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
-from tensordict import TensorDict
-from torch import Tensor
 
 from vusfa.envs.goals import GoalSpec
-from vusfa.envs.navigation import TargetNavEnv
-from vusfa.envs.observation import observation_table
-from vusfa.envs.starts import DRAW_LIMIT
+from vusfa.envs.gym_task import GymTask, Observation, Scenes
 from vusfa.errors import ConfigError
-from vusfa.scenes import SceneSet
 
 __all__ = ["ENV_ID", "TargetNavGym", "TargetNavVector", "register"]
 
 ENV_ID = "vusfa/TargetNav-v0"
-
-Scenes = SceneSet | str | PathLike[str] | Sequence[str | PathLike[str]]
-Observation = dict[str, Any]
 
 
 def register() -> None:
@@ -50,106 +39,6 @@ def register() -> None:
             entry_point="vusfa.envs.gym:TargetNavGym",
             vector_entry_point="vusfa.envs.gym:TargetNavVector",
         )
-
-
-class _Rows(TargetNavEnv):
-    """A batched environment whose rows draw from generators of their own, as Gymnasium's seeding has it."""
-
-    def __init__(self, scenes: Scenes | None, num_rows: int, **options: Any) -> None:
-        if not isinstance(scenes, SceneSet):
-            scenes = SceneSet.bundled() if scenes is None else SceneSet.open(scenes)
-        self.__dict__["rngs"] = [None] * num_rows
-        self.__dict__["drawing"] = np.zeros(num_rows, dtype=np.bool_)
-        super().__init__(scenes, batch_size=[num_rows], **options)
-
-    def _draw(self, *count: int) -> Tensor:
-        draws = np.zeros((self.numel(), *count), dtype=np.int64)
-        for row in self.drawing.nonzero()[0]:
-            draws[row] = self.rngs[row].integers(DRAW_LIMIT, size=count)
-        return torch.from_numpy(np.moveaxis(draws, 0, -1))
-
-
-class _Task:
-    """What the single and the vector version share: the rows, where they are, and how they are seen."""
-
-    def __init__(
-        self,
-        scenes: Scenes | None,
-        num_rows: int,
-        observation: str,
-        render_mode: str | None,
-        panels: Sequence[str] | None,
-        options: dict[str, Any],
-    ) -> None:
-        if observation not in ("index", "features", "pixels"):
-            raise ConfigError(f"observation is {observation!r}; it is 'index', 'features' or 'pixels'")
-        if render_mode not in (None, "rgb_array"):
-            raise ConfigError(f"render_mode is {render_mode!r}; it is None or 'rgb_array'")
-        self.rows = _Rows(scenes, num_rows, **options)
-        self.panels = panels
-        self.data = TensorDict(batch_size=[num_rows])
-        world = self.rows.scenes
-        self.table = None if observation == "index" else observation_table(world, observation)[:, 0].numpy()
-        self.observation_space = self._space()
-        self.action_space = spaces.Discrete(world.num_actions)
-
-    def _space(self) -> spaces.Dict:
-        world, history = self.rows.scenes, self.rows.history
-        scene = spaces.Discrete(world.num_scenes)
-        if self.table is None:
-            return spaces.Dict(
-                state_id=spaces.MultiDiscrete([world.num_states] * history),
-                goal_id=spaces.Discrete(world.num_states),
-                scene_id=scene,
-            )
-        is_pixels = self.table.dtype == np.uint8
-        low, high = (0, 255) if is_pixels else (self.table.min(), self.table.max())
-        box: dict[str, Any] = {"low": low, "high": high, "dtype": self.table.dtype.type}
-        return spaces.Dict(
-            observation=spaces.Box(shape=(history, *self.table.shape[1:]), **box),
-            goal_observation=spaces.Box(shape=self.table.shape[1:], **box),
-            scene_id=scene,
-        )
-
-    def begin(self, mask: np.ndarray, options: dict[str, Any] | None) -> None:
-        """New episodes in the rows of the mask: at a chosen ``state`` towards a chosen ``goal``, or drawn."""
-        self.rows.drawing = mask
-        chosen = {key: value for key, value in (options or {}).items() if key in ("state", "goal")}
-        if len(chosen) == 1:
-            raise ConfigError(
-                f"reset options hold only {next(iter(chosen))!r}; give 'state' and 'goal', or neither"
-            )
-        fresh = self.rows.set_state(**chosen) if chosen else self.rows.reset()
-        self.data = fresh if mask.all() else torch.where(torch.from_numpy(mask), fresh, self.data)
-
-    def step(self, action: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Move every row; its reward (float64), termination and truncation, (n,) each."""
-        self.data.set("action", torch.from_numpy(np.asarray(action, dtype=np.int64)))
-        after = self.rows.step(self.data).get("next")
-        reward, terminated, truncated = (
-            after.get(key)[:, 0].numpy() for key in ("reward", "terminated", "truncated")
-        )
-        self.data = after.exclude("reward")
-        return reward.astype(np.float64), terminated, truncated
-
-    def observe(self) -> Observation:
-        """What the rows see, (n, ...) each."""
-        state, goal, scene = (self.data.get(key).numpy() for key in ("state_id", "goal_id", "scene_id"))
-        if self.table is None:
-            return {"state_id": state.copy(), "goal_id": goal.copy(), "scene_id": scene.copy()}
-        return {
-            "observation": self.table[state],
-            "goal_observation": self.table[goal],
-            "scene_id": scene.copy(),
-        }
-
-    def info(self) -> dict[str, np.ndarray]:
-        """What the rows may be told besides, (n,) each."""
-        collided, path = (self.data.get(key)[:, 0].numpy() for key in ("collided", "shortest_path"))
-        return {"collided": collided.copy(), "shortest_path": path.copy()}
-
-    def render(self, row: int) -> np.ndarray:
-        return self.rows.render(self.data, row, self.panels)
 
 
 class TargetNavGym(gymnasium.Env[Observation, np.int64]):
@@ -194,7 +83,7 @@ class TargetNavGym(gymnasium.Env[Observation, np.int64]):
         **options: Any,
     ) -> None:
         options = {"goals": goals, "goal_sampling": goal_sampling, **options}
-        self._task = _Task(scenes, 1, observation, render_mode, panels, options)
+        self._task = GymTask(scenes, 1, observation, render_mode, panels, options)
         self.render_mode = render_mode
         self.observation_space = self._task.observation_space
         self.action_space = self._task.action_space
@@ -254,7 +143,7 @@ class TargetNavVector(VectorEnv[Observation, np.ndarray, np.ndarray]):
         **options: Any,
     ) -> None:
         options = {"goals": goals, "goal_sampling": goal_sampling, **options}
-        self._task = _Task(scenes, num_envs, observation, render_mode, panels, options)
+        self._task = GymTask(scenes, num_envs, observation, render_mode, panels, options)
         self._ended = np.zeros(num_envs, dtype=np.bool_)
         self._seeds = [-1] * num_envs
         self.num_envs = num_envs

@@ -8,49 +8,23 @@ walking stands in the tensordict. So a rollout can be taken up anywhere, and a s
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
-from torchrl.data import Bounded, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
 
 from vusfa.envs import dynamics
 from vusfa.envs.goals import GoalSpec, resolve_goals
 from vusfa.envs.rendering import draw_panels
-from vusfa.envs.starts import (
-    DRAW_LIMIT,
-    GoalTable,
-    StartTable,
-    draw_goals,
-    draw_starts,
-    paths_from,
-    start_table,
-)
+from vusfa.envs.starts import DRAW_LIMIT, GoalTable, draw_goals, draw_starts, paths_from
+from vusfa.envs.world import env_specs, make_world, map_tensors
 from vusfa.errors import ConfigError, GoalError
 from vusfa.scenes import SceneSet
 
 __all__ = ["TargetNavEnv"]
-
-
-class _World(NamedTuple):
-    """The tables that a step looks things up in. Not buffers: nn.Module finds those ten times slower."""
-
-    successor: Tensor  # (S, A)
-    blocked: Tensor  # (S, A)
-    rewards: dynamics.Rewards
-    starts: StartTable
-    rows: GoalTable | None  # (*B,), the goal of each row; None when goals are drawn
-    distance: Tensor  # flat, scene after scene
-
-
-def _map(function: Callable[[Tensor], Tensor], tables: Any) -> Any:
-    """Apply a function to every tensor of nested named tuples."""
-    if isinstance(tables, Tensor):
-        return function(tables)
-    return None if tables is None else type(tables)(*(_map(function, entry) for entry in tables))
 
 
 class TargetNavEnv(EnvBase):
@@ -141,7 +115,10 @@ class TargetNavEnv(EnvBase):
         self.goal_sampling = goal_sampling
         self.goals = resolve_goals(self.scenes, goals)
         rewards = dynamics.Rewards.of(goal_reward, step_reward, collision_reward)
-        self._world = self._make_world(rewards, first_goal)
+        rows = None
+        if goal_sampling == "fixed":
+            rows = (torch.arange(self.numel()) + first_goal).reshape(self.batch_size)
+        self._world = make_world(self.scenes, self.goals, rewards, rows)
         self._make_specs()
         self._generator = torch.Generator()
         self._seed: int | None = None
@@ -150,41 +127,13 @@ class TargetNavEnv(EnvBase):
         if device is not None:
             self.to(device)
 
-    def _make_world(self, rewards: dynamics.Rewards, first_goal: int) -> _World:
-        scenes = self.scenes
-        starts = start_table(
-            [scene.graph for scene in scenes.scenes], scenes.offsets, self.goals, scenes.names
-        )
-        rows = None
-        if self.goal_sampling == "fixed":
-            slot = (torch.arange(self.numel()) + first_goal) % len(self.goals)
-            rows = starts.goals.take(slot.reshape(self.batch_size))
-        return _World(
-            successor=scenes.successor,
-            blocked=scenes.blocked,
-            rewards=rewards,
-            starts=starts,
-            rows=rows,
-            distance=scenes.distance_tables[0],
-        )
-
     def _make_specs(self) -> None:
-        batch, scenes = self.batch_size, self.scenes
-        state = {
-            "state_id": Categorical(scenes.num_states, shape=(*batch, self.history), dtype=torch.int64),
-            "goal_id": Categorical(scenes.num_states, shape=batch, dtype=torch.int64),
-            "scene_id": Categorical(scenes.num_scenes, shape=batch, dtype=torch.int64),
-            "shortest_path": _count(batch),
-            "step_count": _count(batch),
-        }
-        truth = Categorical(2, shape=(*batch, 1), dtype=torch.bool)
-        self.state_spec = Composite(state, shape=batch)
-        self.observation_spec = Composite({**state, "collided": truth}, shape=batch).clone()
-        self.action_spec = Categorical(scenes.num_actions, shape=batch, dtype=torch.int64)
-        self.reward_spec = Unbounded(shape=(*batch, 1), dtype=torch.float32)
-        self.full_done_spec = Composite(
-            {key: truth.clone() for key in ("done", "terminated", "truncated")}, shape=batch
-        )
+        specs = env_specs(self.scenes, self.batch_size, self.history)
+        self.state_spec = specs.state
+        self.observation_spec = specs.observation
+        self.action_spec = specs.action
+        self.reward_spec = specs.reward
+        self.full_done_spec = specs.done
 
     # -- the two halves of an episode ------------------------------------------------------------------------
 
@@ -381,7 +330,7 @@ class TargetNavEnv(EnvBase):
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> TargetNavEnv:
         """What every move of a module comes down to; the tables move along, and the generator begins anew."""
         super()._apply(fn, recurse)
-        self._world = _map(fn, self._world)
+        self._world = map_tensors(fn, self._world)
         device = self._world.successor.device
         if device != self._generator.device:
             # A generator's state means nothing on another kind of device: draws begin again from the seed.
@@ -442,10 +391,6 @@ class TargetNavEnv(EnvBase):
         except (IndexError, ValueError) as error:
             raise ConfigError(f"there is no row {row}; the batch is {tuple(self.batch_size)}") from error
         return draw_panels(self.scenes, trail, goal, panels)
-
-
-def _count(batch: torch.Size) -> Bounded:
-    return Bounded(0, torch.iinfo(torch.int64).max, shape=(*batch, 1), dtype=torch.int64)
 
 
 def _check_arguments(*, history: int, max_steps: int, goal_sampling: str, first_goal: int) -> None:
