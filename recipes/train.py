@@ -24,9 +24,9 @@ from vusfa.training import (
     ProgressLine,
     Session,
     StopOnSignal,
+    annealed,
     check_goals_dealt,
     descend,
-    learning_rate,
     make_collector,
     make_env,
     make_loggers,
@@ -61,7 +61,9 @@ def train(cfg: DictConfig, overrides: list[str]) -> tuple[Session, Comparison | 
     check_goals_dealt(len(goals), cfg.collector.num_envs, cfg.env.goal_sampling)
     agent = make_agent(scenes=scenes, **{k: v for k, v in plain["agent"].items() if v is not None}).to(device)
     actor, critic = agent.get_policy_operator(), agent.get_value_operator()
-    loss, estimator, multiplier = make_loss(actor, critic, **plain["objective"])
+    loss, estimator, multiplier = make_loss(
+        actor, critic, entropy_coeff=plain["entropy"]["start"], **plain["objective"]
+    )
     optimiser = make_optimiser(
         agent.parameters(), optim["kind"], optim["lr"], optim["max_grad_norm"], **optim["options"]
     )
@@ -95,7 +97,8 @@ def train(cfg: DictConfig, overrides: list[str]) -> tuple[Session, Comparison | 
                     estimator(batch)
                 with half():
                     terms = loss(batch)
-                lr = learning_rate(before, optim["lr"], optim["horizon"])
+                lr = annealed(before, optim["lr"], optim["horizon"])
+                loss.entropy_coeff = annealed(before, **plain["entropy"])
                 norm = descend(optimiser, total_loss(loss, terms), lr, optim["max_grad_norm"])
                 if multiplier is not None:
                     multiplier.step()

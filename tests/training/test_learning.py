@@ -14,7 +14,7 @@ from vusfa.errors import ConfigError
 from vusfa.modules import make_agent
 from vusfa.objectives import USFLoss
 from vusfa.scenes import Scene, SceneSet
-from vusfa.training import descend, learning_rate, make_loss, make_optimiser, total_loss
+from vusfa.training import annealed, descend, make_loss, make_optimiser, total_loss
 from vusfa.training.learning import loss_state
 
 COEFFICIENTS = {
@@ -116,6 +116,13 @@ def test_optimisers_by_name():
 
 
 def test_the_rate_ends_at_zero():
-    assert learning_rate(0, 7e-4, 100) == 7e-4
-    assert learning_rate(100, 7e-4, 100) == 0.0
-    assert learning_rate(130, 7e-4, 100) == 0.0
+    assert annealed(0, 7e-4, 100) == 7e-4
+    assert annealed(100, 7e-4, 100) == 0.0
+    assert annealed(130, 7e-4, 100) == 0.0
+
+
+def test_a_coefficient_goes_from_start_to_end_and_stays():
+    assert annealed(0, 0.08, 200, end=0.008) == 0.08
+    assert annealed(100, 0.08, 200, end=0.008) == pytest.approx(0.044)
+    assert annealed(500, 0.08, 200, end=0.008) == pytest.approx(0.008)
+    assert annealed(500, 0.08, None, end=0.008) == 0.08

@@ -18,6 +18,7 @@ from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase, dispatch
 from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor
+from torchrl.modules import set_recurrent_mode
 from torchrl.objectives.value import ValueEstimatorBase
 
 from vusfa.objectives.functional import lambda_return, n_step_return
@@ -55,6 +56,8 @@ class USFEstimator(ValueEstimatorBase):
         n_steps: bootstrap after this many steps at the latest; ``None`` for the rollout's end. Needs
             ``lmbda=1``.
         normalize_advantage: shift and scale the advantages of a batch to mean 0 and deviation 1.
+        min_advantage_std: divide by no less than this. While rewards are rare all advantages are small errors
+            of the critic; brought to deviation 1 they would drive the policy somewhere at random.
         bootstrap_at_timeout: ``False`` takes a time-out for a terminal, as the paper's released code does.
         embedding_at: ``"next"`` sums the embeddings from s_{t+1} on (the paper's Eqs. 4 and 13 and its code),
             ``"current"`` from s_t on (its Eq. 6).
@@ -91,6 +94,7 @@ class USFEstimator(ValueEstimatorBase):
         lmbda: float = 1.0,
         n_steps: int | None = None,
         normalize_advantage: bool = False,
+        min_advantage_std: float = 1e-4,
         bootstrap_at_timeout: bool = True,
         embedding_at: str = "next",
         device: torch.device | str | None = None,
@@ -110,7 +114,10 @@ class USFEstimator(ValueEstimatorBase):
         self.gamma = gamma
         self.lmbda = lmbda
         self.n_steps = n_steps
+        if not min_advantage_std > 0.0:
+            raise ValueError(f"USFEstimator: min_advantage_std is {min_advantage_std}; give a number above 0")
         self.normalize_advantage = normalize_advantage
+        self.min_advantage_std = min_advantage_std
         self.bootstrap_at_timeout = bootstrap_at_timeout
         self.embedding_at = embedding_at
 
@@ -214,7 +221,7 @@ class USFEstimator(ValueEstimatorBase):
             value_target, successor_target = both.split([reward.shape[-1], embedding.shape[-1]], -1)
         advantage = value_target - value
         if self.normalize_advantage:
-            advantage = _normalize(advantage, mask)
+            advantage = _normalize(advantage, mask, self.min_advantage_std)
         targets = TensorDict({}, data.batch_size)
         targets.set(keys.advantage, advantage)
         targets.set(keys.value_target, value_target)
@@ -282,14 +289,16 @@ def _evaluate_sequences(
     """As :func:`evaluate_rollout`, for recurrent critics: T+1 states in order, and sequences of one state."""
     time = root.batch_dims - 1
     end = _complete(following[..., -1:], root[..., -1:], in_keys)
-    outputs = critic(torch.cat([root, end], time))
+    with set_recurrent_mode(True):
+        outputs = critic(torch.cat([root, end], time))
     values = [outputs.get(key) for key in out_keys]
     at_root = [value.narrow(time, 0, outside.shape[-1]) for value in values]
     at_next = [value.narrow(time, 1, outside.shape[-1]) for value in values]
     inside = outside.clone()
     inside[..., -1] = False
     if inside.any():
-        ends = critic(_complete(following[inside], root[inside], in_keys).unsqueeze(-1))
+        with set_recurrent_mode(True):
+            ends = critic(_complete(following[inside], root[inside], in_keys).unsqueeze(-1))
         for i, key in enumerate(out_keys):
             at_next[i] = at_next[i].clone()
             at_next[i][inside] = ends.get(key).squeeze(1)
@@ -323,9 +332,9 @@ def _cut_at_padding(done: Tensor, mask: Tensor | None) -> Tensor:
     return done | padding_follows
 
 
-def _normalize(advantage: Tensor, mask: Tensor | None) -> Tensor:
+def _normalize(advantage: Tensor, mask: Tensor | None, min_std: float) -> Tensor:
     if mask is None:
         valid = advantage
     else:
         valid = advantage[mask.reshape(*mask.shape[: advantage.ndim - 1], -1).any(-1)]
-    return (advantage - valid.mean()) / valid.std(correction=0).clamp_min(1e-4)
+    return (advantage - valid.mean()) / valid.std(correction=0).clamp_min(min_std)

@@ -5,7 +5,7 @@
 
 from vusfa.training.checkpoint import load_checkpoint, save_checkpoint
 from vusfa.training.collectors import check_goals_dealt, make_collector, make_env
-from vusfa.training.learning import descend, learning_rate, make_loss, make_optimiser, total_loss
+from vusfa.training.learning import annealed, descend, make_loss, make_optimiser, total_loss
 from vusfa.training.loggers import make_loggers
 from vusfa.training.metrics import EpisodeMeter, MeanMeter
 from vusfa.training.progress import ProgressLine
@@ -18,9 +18,9 @@ __all__ = [
     "ProgressLine",
     "Session",
     "StopOnSignal",
+    "annealed",
     "check_goals_dealt",
     "descend",
-    "learning_rate",
     "load_agent",
     "load_checkpoint",
     "make_collector",

@@ -16,8 +16,8 @@ from vusfa.objectives import DualAscent, TFRMSprop, USFEstimator, USFLoss
 
 __all__ = [
     "OPTIMISERS",
+    "annealed",
     "descend",
-    "learning_rate",
     "loss_state",
     "make_loss",
     "make_optimiser",
@@ -46,6 +46,7 @@ def make_loss(
     lmbda: float = 1.0,
     n_steps: int | None = None,
     normalize_advantage: bool = False,
+    min_advantage_std: float = 1e-4,
     bootstrap_at_timeout: bool = True,
     embedding_at: str = "next",
 ) -> tuple[LossModule, USFEstimator, DualAscent | None]:
@@ -61,7 +62,7 @@ def make_loss(
         bottleneck_on,
             information_reduction, loss_critic_type: of :class:`~vusfa.objectives.USFLoss`.
         bottleneck_step_size, bottleneck_maximum: of :class:`~vusfa.objectives.DualAscent`.
-        gamma, lmbda, n_steps, normalize_advantage, bootstrap_at_timeout, embedding_at: of
+        gamma, lmbda, n_steps, normalize_advantage, min_advantage_std, bootstrap_at_timeout, embedding_at: of
             :class:`~vusfa.objectives.USFEstimator`.
     """
     try:
@@ -71,6 +72,7 @@ def make_loss(
             lmbda=lmbda,
             n_steps=n_steps,
             normalize_advantage=normalize_advantage,
+            min_advantage_std=min_advantage_std,
             bootstrap_at_timeout=bootstrap_at_timeout,
             embedding_at=embedding_at,
         )
@@ -174,13 +176,15 @@ def make_optimiser(
         ) from error
 
 
-def learning_rate(frames: int, lr: float, horizon: int | None) -> float:
-    """The learning rate after so many frames: falling linearly to 0 at ``horizon``, or constant without one.
+def annealed(frames: int, start: float, horizon: int | None, end: float = 0.0) -> float:
+    """A learning rate or coefficient: linear in the frames from ``start`` to ``end`` at ``horizon``, then constant.
 
-    A function of the frames, not of the number of calls: nothing to save, nothing that a resumed run could
-    miscount.
+    Without a horizon it stays at ``start``. A function of the frames, not of the number of calls: nothing to
+    save, nothing that a resumed run could miscount.
 
-    >>> learning_rate(250, lr=4.0, horizon=1000), learning_rate(250, lr=4.0, horizon=None)
+    >>> annealed(250, start=4.0, horizon=1000), annealed(250, start=4.0, horizon=None)
     (3.0, 4.0)
+    >>> annealed(500, start=4.0, horizon=1000, end=1.0), annealed(2000, start=4.0, horizon=1000, end=1.0)
+    (2.5, 1.0)
     """
-    return lr if horizon is None else lr * max(0.0, 1.0 - frames / horizon)
+    return start if horizon is None else start + (end - start) * min(1.0, frames / horizon)
