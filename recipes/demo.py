@@ -24,7 +24,14 @@ def demo(cfg: DictConfig, overrides: list[str]) -> int:
         return exit_code
     folder, agent, scenes = Path(cfg.folder), session.agent.eval(), session.scenes
     floor = next(row for row in result.rows if row["policy"] == "random walk" and row["goals"] == "trained")
-    made = [plot_curve(folder / "metrics.csv", folder / "curve.png", floor["success_500"], cfg.agent.model)]
+    made = [
+        plot_curve(
+            folder / "metrics.csv",
+            folder / "curve.png",
+            floor[f"success_{cfg.evaluation.max_steps}"],
+            cfg.agent.model,
+        )
+    ]
     found = longest_success(result.episodes, scenes)
     if found is not None:
         start, goal = found

@@ -33,6 +33,7 @@ from vusfa.training import (
     make_loss,
     make_optimiser,
     scene_sources,
+    torch_device,
     total_loss,
 )
 from vusfa.training.launch import launch
@@ -50,7 +51,7 @@ def train(cfg: DictConfig, overrides: list[str]) -> tuple[Session, Comparison | 
         it.
     """
     torch.manual_seed(cfg.seed)
-    device, checkpoint = torch.device(cfg.device), Path(cfg.folder) / "checkpoint.pt"
+    device, checkpoint = torch_device(cfg.device), Path(cfg.folder) / "checkpoint.pt"
     plain: dict[str, Any] = OmegaConf.to_container(cfg, resolve=True)  # type: ignore[assignment]
     optim = plain["optim"]
     half = partial(torch.autocast, device.type, torch.bfloat16, enabled=cfg.autocast)
@@ -72,7 +73,8 @@ def train(cfg: DictConfig, overrides: list[str]) -> tuple[Session, Comparison | 
     settings = {"config": plain, "overrides": overrides, "sources": scene_sources(cfg.scenes)}
     session = Session(scenes, goals, agent, loss.to(device), optimiser, settings)
     if cfg.resume:
-        session.resume(cfg.resume)
+        for change in session.resume(cfg.resume):
+            print(f"resumed with {change}", file=sys.stderr)
     history = agent.config["history"]
     env = partial(make_env, scenes, agent.make_env_transforms(), history=history, device=device)
     env = partial(env, **{**plain["env"], "goals": goals})
@@ -89,16 +91,12 @@ def train(cfg: DictConfig, overrides: list[str]) -> tuple[Session, Comparison | 
         with StopOnSignal() as stop, session.collecting(collector) as batches, progress:
             while session.frames < cfg.total_frames and not stop.received:
                 began, before = time.monotonic(), session.frames
-                # Three blocks: autocast keeps weights that it converted without gradients until its block
-                # ends.
-                with half():
-                    batch = next(batches)
-                with half():
-                    estimator(batch)
-                with half():
-                    terms = loss(batch)
                 lr = annealed(before, optim["lr"], optim["horizon"])
                 loss.entropy_coeff = annealed(before, **plain["entropy"])
+                with half():
+                    batch = estimator(next(batches))
+                with half():  # a block of its own: autocast keeps weights that it converted without gradients
+                    terms = loss(batch)
                 norm = descend(optimiser, total_loss(loss, terms), lr, optim["max_grad_norm"])
                 if multiplier is not None:
                     multiplier.step()

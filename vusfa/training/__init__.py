@@ -9,7 +9,7 @@ from vusfa.training.learning import annealed, descend, make_loss, make_optimiser
 from vusfa.training.loggers import make_loggers
 from vusfa.training.metrics import EpisodeMeter, MeanMeter
 from vusfa.training.progress import ProgressLine
-from vusfa.training.session import Session, load_agent, rebuild_agent, scene_sources
+from vusfa.training.session import Session, load_agent, rebuild_agent, scene_sources, torch_device
 from vusfa.training.signals import StopOnSignal
 
 __all__ = [
@@ -31,5 +31,6 @@ __all__ = [
     "rebuild_agent",
     "save_checkpoint",
     "scene_sources",
+    "torch_device",
     "total_loss",
 ]

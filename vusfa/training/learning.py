@@ -177,7 +177,8 @@ def make_optimiser(
 
 
 def annealed(frames: int, start: float, horizon: int | None, end: float = 0.0) -> float:
-    """A learning rate or coefficient: linear in the frames from ``start`` to ``end`` at ``horizon``, then constant.
+    """A learning rate or coefficient: linear in the frames from ``start`` to ``end`` at ``horizon``, then
+    constant.
 
     Without a horizon it stays at ``start``. A function of the frames, not of the number of calls: nothing to
     save, nothing that a resumed run could miscount.

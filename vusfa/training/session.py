@@ -15,7 +15,7 @@ from torch import Tensor
 from torchrl.collectors import BaseCollector
 from torchrl.objectives import LossModule
 
-from vusfa.errors import CheckpointError
+from vusfa.errors import CheckpointError, ConfigError
 from vusfa.modules import Agent, make_agent
 from vusfa.scenes import SceneSet, bundled_names
 from vusfa.training.checkpoint import (
@@ -28,12 +28,15 @@ from vusfa.training.checkpoint import (
 )
 from vusfa.training.collectors import collector_state, load_collector_state
 from vusfa.training.learning import loss_state
+from vusfa.training.loggers import flat
 from vusfa.training.metrics import EpisodeMeter, MeanMeter
 
-__all__ = ["Session", "load_agent", "rebuild_agent", "scene_sources"]
+__all__ = ["Session", "load_agent", "rebuild_agent", "scene_sources", "torch_device"]
 
 # entries of Agent.config that describe the scenes, not the agent
 _OF_SCENES = ("scenes", "fingerprint", "num_actions")
+# buffers of the loss that the training moves; the others are settings
+_ADAPTED = ("bottleneck_coeff", "last_kl")
 
 
 @dataclass
@@ -150,12 +153,17 @@ class Session:
             },
         )
 
-    def resume(self, path: str | Path) -> None:
-        """Go on from a checkpoint. With a single collector what follows is what would have followed, number
-        for number.
+    def resume(self, path: str | Path) -> list[str]:
+        """Go on from a checkpoint; to be called before :meth:`collecting`.
+
+        With a single collector what follows is what would have followed, number for number. Coefficients and
+        the optimiser's numbers are those of the settings now; what the training itself has moved is restored.
+
+        Returns:
+            settings that differ from the checkpoint's, one line each.
 
         Raises:
-            CheckpointError: the file is damaged, or of another model, other scenes or other goals.
+            CheckpointError: the file is damaged, or of another model, other scenes, goals or optimiser.
         """
         state = load_checkpoint(path, next(self.agent.parameters()).device)
         check_scenes(path, state["scenes"], self.scenes)
@@ -164,16 +172,21 @@ class Session:
                 check_setting(path, f"agent.{key}", state["agent_config"].get(key), value)
         check_setting(path, "env.goals", state["goals"].tolist(), self.goals.tolist())
         _load_weights(self.agent, state, path)
-        missing, unexpected = self.loss.load_state_dict(state["loss"], strict=False)
-        wrong = [*unexpected, *(key for key in missing if key in loss_state(self.loss))]
-        if wrong:
-            raise CheckpointError(f"{path}: its loss and this one differ in {wrong[0]!r}; start a new run")
-        self.optimiser.load_state_dict(state["optimiser"])
+        _load_optimiser(self.optimiser, state, path)
+        adapted = {key: state["loss"][key] for key in _ADAPTED if key in state["loss"]}
+        self.loss.load_state_dict(adapted, strict=False)
         self.episodes.load_state_dict(state["meter"]["episodes"])
         self.terms.load_state_dict(state["meter"]["terms"])
         for name in ("frames", "updates", "seconds", "run_id"):
             setattr(self, name, state[name])
         self._waiting = {"collector": state["collector"], "rng": state["rng"]}
+        return _changes(state["config"], self.settings["config"])
+
+
+def _changes(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
+    old, new = flat(before), flat(now)
+    keys = [key for key in old.keys() | new.keys() if old.get(key) != new.get(key)]
+    return [f"{key}={new.get(key)} instead of {old.get(key)}" for key in sorted(keys) if key != "resume"]
 
 
 def scene_sources(scenes: str | Sequence[str]) -> list[str]:
@@ -184,6 +197,26 @@ def scene_sources(scenes: str | Sequence[str]) -> list[str]:
     """
     given = [scenes] if isinstance(scenes, str) else list(scenes)
     return [name if name in bundled_names() else str(Path(name).resolve()) for name in given]
+
+
+def torch_device(name: str) -> torch.device:
+    """A device by name.
+
+    Raises:
+        ConfigError: there is none of that name, or not in this machine.
+
+    >>> torch_device("cpu")
+    device(type='cpu')
+    """
+    try:
+        device = torch.device(name)
+        torch.empty(0, device=device)
+    except (RuntimeError, AssertionError, NotImplementedError) as error:
+        first = str(error).splitlines()[0]
+        raise ConfigError(
+            f"device is {name!r}, which cannot be used here ({first}); give cpu or cuda"
+        ) from error
+    return device
 
 
 def rebuild_agent(config: Mapping[str, Any], scenes: SceneSet) -> Agent:
@@ -214,6 +247,7 @@ def load_agent(
         CheckpointError: the file is damaged, or of other scenes.
         SceneError: its scenes are not where they were.
     """
+    device = torch_device(str(device))
     state = load_checkpoint(path, device)
     scenes = (SceneSet.open(state["scenes"]["sources"]) if scenes is None else scenes).to(device)
     check_scenes(path, state["scenes"], scenes)
@@ -230,3 +264,16 @@ def _load_weights(agent: Agent, state: Mapping[str, Any], path: str | Path) -> N
         raise CheckpointError(
             f"{path}: its weights do not fit a {agent.config['model']} agent ({first})"
         ) from error
+
+
+def _load_optimiser(optimiser: torch.optim.Optimizer, state: Mapping[str, Any], path: str | Path) -> None:
+    """The optimiser's memory of gradients; its numbers stay as they are."""
+    saved, settings = state["optimiser"], [dict(group) for group in optimiser.param_groups]
+    if saved["param_groups"][0].keys() != settings[0].keys():
+        raise CheckpointError(
+            f"{path}: its optimiser is not a {type(optimiser).__name__}; leave the setting out,"
+            " or start a new run"
+        )
+    optimiser.load_state_dict(saved)
+    for group, numbers in zip(optimiser.param_groups, settings, strict=True):
+        group.update({key: value for key, value in numbers.items() if key != "params"})

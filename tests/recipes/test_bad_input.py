@@ -1,0 +1,137 @@
+"""Bad input: one line that names the culprit and the mend, exit code not 0, nothing left behind."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+import torch
+
+from vusfa.scenes import Scene
+from vusfa.training.launch import launch
+
+RECIPES = Path(__file__).parents[2] / "recipes"
+
+
+@pytest.fixture
+def run(recipe, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]):
+    """``recipes/train.py`` in an empty folder; gives exit code and standard error."""
+    work = tmp_path / "work"
+    work.mkdir()
+    monkeypatch.chdir(work)
+    module = recipe("train")
+
+    def launched(*arguments: str) -> str:
+        monkeypatch.setattr("sys.argv", ["train.py", *arguments])
+        with pytest.raises(SystemExit) as end:
+            launch(module.main, RECIPES / "conf", "train")
+        out, err = capfd.readouterr()
+        assert end.value.code == 2, err
+        assert list(work.rglob("*")) == []
+        assert out == ""
+        assert err.startswith("error: ")
+        assert err.count("\n") == 1, err
+        return err
+
+    return launched
+
+
+def test_a_truncated_scene(run, scene_file: Path):
+    content = scene_file.read_bytes()
+    scene_file.write_bytes(content[: len(content) // 2])
+    text = run(f"scenes=[{scene_file}]")
+    assert "hall.h5" in text
+    assert "truncated" in text
+
+
+@pytest.mark.parametrize(
+    ("damage", "words"),
+    [
+        (lambda file: file.pop("graph"), ["hall.h5", "'graph'", "missing"]),
+        (lambda file: file["graph"].__setitem__((5, 2), 99), ["hall.h5", "'graph'", "state 5", "99"]),
+        (
+            lambda file: file["resnet_feature"].__setitem__((7, 0, 1), np.nan),
+            ["'resnet_feature'", "state 7", "NaN"],
+        ),
+        (
+            lambda file: file["shortest_path_distance"].__setitem__((2, 9), 1),
+            ["shortest_path_distance", "state 2"],
+        ),
+    ],
+    ids=["missing dataset", "index out of range", "NaN feature", "wrong distance"],
+)
+def test_a_damaged_scene(run, scene_file: Path, damage: Callable, words: list[str]):
+    with h5py.File(scene_file, "r+") as file:
+        damage(file)
+    text = run(f"scenes=[{scene_file}]")
+    for word in words:
+        assert word in text
+
+
+def test_an_unreachable_goal(run, tmp_path: Path):
+    Scene("trap", torch.tensor([[1, -1], [0, -1], [0, -1]]), torch.rand(3, 1, 4)).save(tmp_path / "trap.h5")
+    for kind in ("single", "multi_async"):
+        text = run(
+            f"scenes=[{tmp_path / 'trap.h5'}]", "env.goals=[2]", f"collector={kind}", "agent.hidden_size=8"
+        )
+        assert "scene 'trap': no other state can reach goal 2" in text
+
+
+def test_a_goal_that_does_not_exist(run, scene_file: Path):
+    assert "goal 16 is out of range" in run(f"scenes=[{scene_file}]", "env.goals=[3,16]")
+    assert "hall" in run(f"scenes=[{scene_file}]")  # the paper has no goals for it
+
+
+def test_an_unknown_scene(run):
+    text = run("scenes=[bathrom]")
+    assert "'bathrom' is neither a bundled scene (bathroom" in text
+    assert "none.h5" in run("scenes=[none.h5]")
+
+
+@pytest.mark.parametrize(
+    ("argument", "words"),
+    [
+        ("agent.modle=gvf", "no setting is called 'agent.modle'; did you mean 'agent.model'?"),
+        ("optim.learning_rate=1", "no setting is called 'optim.learning_rate'"),
+        ("agent.model=vufsa", "model is 'vufsa'; did you mean 'vusfa'"),
+        ("preset=papr", "preset=papr: there is no such choice; did you mean 'paper'?"),
+        ("collector.num_envs=many", "collector.num_envs is 'many'; it must be a whole number"),
+        (
+            "collector.kind=multi",
+            "collector.kind is 'multi'; it must be one of single, multi_sync, multi_async",
+        ),
+        ("logger.kinds=[cvs]", "logger.kinds holds 'cvs'"),
+        ("objective.gamma=1.5", "objective: USFEstimator: gamma is 1.5"),
+        ("collector.num_envs=3", "leaves some of the 20 goals without an environment"),
+        ("agent.memory=gru", "memory is 'gru'"),
+        ("device=gpu", "device is 'gpu'"),
+    ],
+)
+def test_an_unknown_key_or_value(run, argument: str, words: str):
+    assert words in run(argument)
+
+
+def test_a_damaged_checkpoint(run, tmp_path: Path):
+    path = tmp_path / "checkpoint.pt"
+    torch.save({"format": 1, "agent": torch.zeros(1000)}, path)
+    path.write_bytes(path.read_bytes()[:3000])
+    assert "checkpoint.pt: not a whole checkpoint (3000 bytes)" in run(f"resume={path}")
+    assert "no such checkpoint" in run("resume=none.pt")
+
+
+def test_as_a_command(tmp_path: Path):
+    done = subprocess.run(
+        [sys.executable, str(RECIPES / "train.py"), "scenes=[bathrom]"],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 2
+    assert done.stderr.startswith("error: 'bathrom' is neither")
+    assert done.stderr.count("\n") == 1
+    assert list(tmp_path.iterdir()) == []

@@ -1,0 +1,94 @@
+"""The configuration: every file says how it is used, and that is true; presets hold the numbers that they
+promise."""
+
+from __future__ import annotations
+
+import shlex
+from pathlib import Path
+
+import pytest
+
+from vusfa.training.launch import compose
+
+CONF = Path(__file__).parents[2] / "recipes" / "conf"
+FILES = sorted(CONF.rglob("*.yaml"))
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda path: str(path.relative_to(CONF)))
+def test_every_file_opens_with_the_line_that_launches_it(path: Path):
+    lines = [line for line in path.read_text().splitlines() if not line.startswith("# @package")]
+    assert lines[0].startswith("# ")
+    command = shlex.split(lines[0].rpartition("python recipes/")[2])
+    recipe, overrides = command[0], command[1:]
+    assert (CONF.parent / recipe).is_file()
+    compose(CONF, Path(recipe).stem, overrides)
+    group = path.relative_to(CONF).parent
+    if group != Path() and path.stem != "index":
+        assert f"{group}={path.stem}" in overrides
+    elif group == Path():
+        assert Path(recipe).stem == path.stem
+
+
+def test_the_groups_mirror_the_package():
+    assert {path.name for path in CONF.iterdir() if path.is_dir()} == {
+        "agent",
+        "collector",
+        "env",
+        "evaluation",
+        "logger",
+        "objective",
+        "optim",
+        "preset",
+    }
+
+
+@pytest.mark.parametrize(
+    ("model", "num_envs", "total_frames", "successor"),
+    [
+        ("gvf", 100, 100_000_000, 0.0),
+        ("usfa", 32, 10_000_000, 5e-4),
+        ("sfdp", 64, 10_000_000, 5e-3),
+        ("vusfa", 100, 100_000_000, 5e-4),
+    ],
+)
+@pytest.mark.parametrize("preset", ["paper", "reference"])
+def test_the_published_numbers(
+    settings, preset: str, model: str, num_envs: int, total_frames: int, successor: float
+):
+    cfg = settings(f"preset={preset}", f"agent.model={model}")
+    assert cfg.agent.preset == preset
+    assert (cfg.collector.num_envs, cfg.collector.rollout, cfg.total_frames) == (num_envs, 5, total_frames)
+    optim = cfg.optim
+    assert (optim.kind, optim.lr, optim.horizon, optim.max_grad_norm) == (
+        "tf_rmsprop",
+        7e-4,
+        total_frames,
+        40.0,
+    )
+    assert optim.options == {"alpha": 0.99, "eps": 0.1, "initial_accumulator": 1.0}
+    objective = cfg.objective
+    # sums over 5 steps, as means over steps times 5
+    assert (objective.objective_coeff, objective.critic_coeff) == (5.0, 1.25)
+    assert (cfg.entropy.start, cfg.entropy.horizon) == (0.05, None)
+    assert (objective.successor_coeff, objective.gamma, objective.lmbda) == (successor, 0.99, 1.0)
+    assert (objective.bottleneck_coeff, objective.bottleneck_step_size) == (0.0, 1e-6)
+    assert (objective.information_target, objective.loss_critic_type) == (0.2, "l2")
+    assert objective.normalize_advantage is False
+    assert objective.bootstrap_at_timeout is (preset == "paper")
+    assert (cfg.env.goal_reward, cfg.env.step_reward, cfg.env.collision_reward) == (1.0, -0.01, None)
+
+
+def test_the_command_line_wins_over_the_preset(settings):
+    cfg = settings(
+        "preset=paper", "optim=adam", "total_frames=5000", "collector.num_envs=20", "collector=multi_async"
+    )
+    assert (cfg.optim.kind, cfg.total_frames, cfg.collector.num_envs, cfg.collector.kind) == (
+        "adam",
+        5000,
+        20,
+        "multi_async",
+    )
+
+
+def test_a_preset_does_not_depend_on_the_one_before(settings):
+    assert settings("preset=controlled") == settings()

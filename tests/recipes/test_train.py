@@ -1,0 +1,162 @@
+"""recipes/train.py: the four models, the three collectors, what a run leaves behind."""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+from pathlib import Path
+
+import pytest
+import torch
+
+from vusfa.evaluation import evaluate
+from vusfa.training import load_agent, load_checkpoint
+
+MODELS = ("gvf", "usfa", "sfdp", "vusfa")
+
+
+def rows(path: Path) -> list[dict[str, str]]:
+    with open(path, newline="") as file:
+        return list(csv.DictReader(file))
+
+
+@pytest.mark.usefixtures("fast_workers")
+@pytest.mark.parametrize("kind", ["single", "multi_sync", "multi_async"])
+@pytest.mark.parametrize("model", MODELS)
+def test_every_model_trains_with_every_collector(
+    recipe, settings, small, tmp_path: Path, capfd: pytest.CaptureFixture[str], model: str, kind: str
+):
+    frames = 20 * (12 if kind == "multi_async" else 24)
+    options = [
+        f"agent.model={model}",
+        f"collector={kind}",
+        f"total_frames={frames}",
+        f"folder={tmp_path / 'run'}",
+    ]
+    cfg = settings(*small, *options)
+    session, result, code = recipe("train").train(cfg, options)
+    assert (session.updates, session.frames, result, code) == (20, frames, None, 0)
+    assert all(bool(param.isfinite().all()) for param in session.agent.parameters())
+
+    agent, scenes, state = load_agent(tmp_path / "run" / "checkpoint.pt")
+    assert state["frames"] == frames
+    for name, value in agent.state_dict().items():
+        assert torch.equal(value, session.agent.state_dict()[name]), name
+    table = evaluate(
+        agent.get_policy_operator(), scenes, state["goals"], episodes_per_goal=2, max_steps=9, history=2
+    )
+    assert len(table) == 6
+    (line, *_) = rows(tmp_path / "run" / "metrics.csv")
+    assert {
+        "success",
+        "scene/hall/success",
+        "goal/hall/3/success",
+        "loss_critic",
+        "grad_norm",
+        "lr",
+    } <= line.keys()
+    out, err = capfd.readouterr()
+    assert "warning" not in (out + err).lower()
+
+
+def test_a_run_learns_and_tells(recipe, settings, small, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    options = [
+        "agent.model=gvf",
+        "agent.hidden_size=32",
+        "agent.embedding_size=32",
+        "total_frames=24000",
+        "log_every=2400",
+        "optim.lr=0.003",
+        "evaluation=trained",
+        "evaluation.episodes_per_goal=30",
+        "evaluation.max_steps=60",
+        f"folder={tmp_path / 'run'}",
+    ]
+    _, result, _ = recipe("train").train(settings(*small, *options), options)
+    log = rows(tmp_path / "run" / "metrics.csv")
+    assert [int(line["frames"]) for line in log] == list(range(2400, 24001, 2400))
+    (row,) = [row for row in result.rows if (row["policy"], row["goals"]) == ("gvf", "trained")]
+    assert row["success_60"] > 0.95
+    assert float(log[-1]["length_ratio"]) < float(log[0]["length_ratio"])
+    assert rows(tmp_path / "run" / "evaluation.csv")[0]["policy"] == "gvf"
+    assert len(rows(tmp_path / "run" / "evaluation_episodes.csv")) == 90
+    config = json.loads((tmp_path / "run" / "config.json").read_text())
+    assert (config["agent"]["model"], config["total_frames"]) == ("gvf", 24000)
+    written = capsys.readouterr()
+    assert "trained goals" in written.out
+    assert "random walk" in written.out
+    assert "24,000 of 24,000 frames" in written.err
+    state = load_checkpoint(tmp_path / "run" / "checkpoint.pt")
+    assert state["overrides"] == options
+    assert state["scenes"]["names"] == ["hall"]
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        ["autocast=true", "agent.model=vusfa"],
+        ["agent=lstm", "agent.model=usfa"],
+        ["agent=pixels", "agent.model=gvf", "agent.picture_size=[36,44]"],
+        ["preset=paper", "agent.model=sfdp", "collector.num_envs=6", "env.max_steps=20"],
+        ["preset=reference", "agent.model=vusfa", "collector.num_envs=6"],
+        ["env.goal_sampling=episode", "env.goals=all", "optim=rmsprop", "objective.lmbda=0.9"],
+    ],
+    ids=lambda options: "-".join(options[:2]),
+)
+def test_options_train(recipe, settings, small, tmp_path: Path, options: list[str]):
+    kept = [item for item in small if item.partition("=")[0] not in {o.partition("=")[0] for o in options}]
+    if any("lstm" in option or "reference" in option for option in options):
+        kept.remove("agent.history=2")
+    cfg = settings(*kept, *options, "total_frames=480", f"folder={tmp_path / 'run'}")
+    session, _, _ = recipe("train").train(cfg, options)
+    assert session.updates == 20
+    assert all(bool(param.isfinite().all()) for param in session.agent.parameters())
+    agent, scenes, _ = load_agent(tmp_path / "run" / "checkpoint.pt")
+    evaluate(agent.get_policy_operator(), scenes, [3], max_steps=9, history=agent.config["history"])
+
+
+@pytest.mark.filterwarnings("default")  # TensorBoard and wandb themselves
+def test_all_loggers_hear_of_a_run(recipe, settings, small, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setenv("WANDB_DATA_DIR", str(tmp_path / "data"))
+    options = [
+        "logger.kinds=[csv,tensorboard,wandb]",
+        "logger.mode=offline",
+        "evaluation=trained",
+        "evaluation.episodes_per_goal=2",
+        "evaluation.max_steps=20",
+        f"folder={tmp_path / 'run'}",
+    ]
+    session, _, _ = recipe("train").train(settings(*small, *options), options)
+    (stored,) = (tmp_path / "run" / "wandb").glob(f"offline-run-*/run-{session.run_id}.wandb")
+    content = stored.read_bytes()
+    for word in (
+        b"goal/hall/3/success",
+        b"scene/hall/length_ratio",
+        b"loss_critic",
+        b"evaluation",
+        b"checkpoint-",
+    ):
+        assert word in content, word
+    assert list((tmp_path / "run" / "tensorboard").glob("events*"))
+
+
+def test_the_multiplier_moves_and_the_rate_falls(recipe, settings, small, tmp_path: Path):
+    options = [
+        "agent.model=vusfa",
+        "objective.bottleneck_step_size=0.5",
+        "objective.information_target=0.0",
+        "optim.horizon=480",
+        f"folder={tmp_path / 'run'}",
+    ]
+    session, _, _ = recipe("train").train(settings(*small, *options), options)
+    log = rows(tmp_path / "run" / "metrics.csv")
+    betas = [float(line["beta"]) for line in log]
+    assert betas == sorted(betas)
+    assert betas[-1] > betas[0]
+    assert float(session.loss.bottleneck_coeff) > betas[-1]
+    rates = [float(line["lr"]) for line in log]
+    lr = settings(*small).optim.lr
+    assert rates[0] == pytest.approx(lr * (1 - 24 / 480))
+    assert rates[-1] == pytest.approx(lr * (1 - 456 / 480))
+    assert all(not math.isnan(float(line["kl"])) for line in log)

@@ -1,0 +1,68 @@
+"""recipes/zero_shot.py on checkpoints of all models."""
+
+from __future__ import annotations
+
+import csv
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+
+ZERO_SHOT = Path(__file__).parents[2] / "recipes" / "zero_shot.py"
+
+
+@pytest.mark.parametrize("model", ["gvf", "usfa", "sfdp", "vusfa"])
+def test_every_state_is_a_goal(
+    recipe, settings, small, tmp_path: Path, capsys: pytest.CaptureFixture[str], model: str
+):
+    options = [f"agent.model={model}", "total_frames=48", f"folder={tmp_path / 'run'}"]
+    recipe("train").train(settings(*small, *options), options)
+    recipe("zero_shot").zero_shot(tmp_path / "run" / "checkpoint.pt", episodes=2, max_steps=30, seed=1)
+    printed = capsys.readouterr().out
+    for word in (
+        "trained goals",
+        "unseen goals",
+        "all goals",
+        model,
+        "untrained",
+        "random walk",
+        "shortest path",
+    ):
+        assert word in printed
+    for suffix in (".csv", ".json", "_episodes.csv"):
+        assert f"zero_shot{suffix}" in printed.replace("\n", "")
+    with open(tmp_path / "run" / "zero_shot_episodes.csv", newline="") as file:
+        episodes = list(csv.DictReader(file))
+    assert len(episodes) == 16 * 2
+    assert {row["goal"] for row in episodes if row["trained"] == "1"} == {"3", "9", "12"}
+    read = json.loads((tmp_path / "run" / "zero_shot.json").read_text())
+    assert read["settings"]["max_steps"] == 30
+    assert read["note"] == "Every goal can be reached from every start."
+    success = {(row["policy"], row["goals"]): row["success_30"] for row in read["rows"]}
+    assert success["shortest path", "all"] == 1.0
+    assert success["random walk", "all"] < success["shortest path", "all"]
+    assert success[model, "all"] != success["untrained", "all"] or model == "gvf"
+
+
+def test_same_seed_same_table(recipe, settings, small, tmp_path: Path):
+    recipe("train").train(settings(*small, "total_frames=48", f"folder={tmp_path}"), [])
+    found = []
+    for name in ("one", "two"):
+        torch.manual_seed(len(found))
+        recipe("zero_shot").zero_shot(
+            tmp_path / "checkpoint.pt", episodes=1, max_steps=20, out=tmp_path / name
+        )
+        found.append([(tmp_path / f"{name}{suffix}").read_text() for suffix in (".csv", "_episodes.csv")])
+    assert found[0] == found[1]
+
+
+def test_as_a_command(tmp_path: Path):
+    done = subprocess.run(
+        [sys.executable, str(ZERO_SHOT), "none.pt"], cwd=tmp_path, capture_output=True, text=True
+    )
+    assert done.returncode == 1
+    assert done.stderr.startswith("error: none.pt: no such checkpoint")
+    assert done.stderr.count("\n") == 1
