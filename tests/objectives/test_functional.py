@@ -276,6 +276,13 @@ class TestTerms:
         torch.testing.assert_close(kl.detach(), torch.tensor([0.5 * (-math.log(1e-8) - 1)]))
         assert scale.grad.isfinite().all()
 
+    def test_gaussian_kl_of_half_precision_is_summed_in_full(self) -> None:
+        loc, scale = torch.tensor([0.0, 0.0625]).half(), torch.tensor([0.0, 1.0]).half()
+        expected = gaussian_kl(loc.float(), scale.float())
+        result = gaussian_kl(loc, scale)
+        assert result.dtype == torch.float32
+        torch.testing.assert_close(result, expected, rtol=0, atol=0)
+
     def test_information_bottleneck(self) -> None:
         kl = torch.tensor([0.1, 0.7], requires_grad=True)
         loss = information_bottleneck(kl, 3.0, 0.2)

@@ -12,7 +12,6 @@ from tensordict import TensorDict
 from tensordict.nn import TensorDictModule as Mod
 from tensordict.nn import TensorDictSequential as Seq
 from torch import Tensor, nn
-from torchrl.envs.utils import set_exploration_type
 from torchrl.modules import LSTMModule, set_recurrent_mode
 from torchrl.objectives.value import GAE, TDLambdaEstimator
 
@@ -204,6 +203,10 @@ class TestTargets:
         assert td["value_target"].dtype == td["successor_target"].dtype == torch.float32
         torch.testing.assert_close(td["value_target"][0], torch.tensor([1.5]))
         torch.testing.assert_close(td["successor_target"][0], torch.tensor([51.0]))
+        plain = Mod(lambda s: (0.3 * s).bfloat16(), in_keys=["s"], out_keys=["state_value"])
+        td = USFEstimator(value_network=plain, gamma=0.99)(td.exclude("value_target", "advantage"))
+        written = torch.tensor(0.3).bfloat16().float()
+        torch.testing.assert_close(td["value_target"][-1:, 0], 0.01 + 0.99 * written[None], rtol=0, atol=1e-7)
 
 
 class TestOneEvaluation:
@@ -226,6 +229,9 @@ class TestOneEvaluation:
         torch.testing.assert_close(with_zeros["advantage"], td["next", "reward"])
         assert (estimator(td.clone())["advantage"] - td["next", "reward"]).abs().min() > 1e-4
         torch.testing.assert_close(estimator.value_estimate(td, target_params=params), td["next", "reward"])
+        own = TensorDict.from_module(critic).data
+        with_zeros = estimator(td.clone(), params=own, target_params=params)
+        torch.testing.assert_close(with_zeros["advantage"], td["next", "reward"])
 
     def test_what_the_next_state_lacks_is_the_roots(self, usf, rollout) -> None:
         """A goal that stays need not be stored twice."""
@@ -355,9 +361,9 @@ class TestRecurrentCritics:
         phi = Mod(nn.Linear(3, 2), in_keys=["observation"], out_keys=["state_embedding"])
         return Seq(lstm, head, psi, phi)
 
-    def rollout(self, critic: Seq, rollout, batch: int, steps: int) -> TensorDict:
+    def rollout(self, critic: Seq, rollout, batch: int, steps: int, seed: int) -> TensorDict:
         """As a collector writes it: the hidden state is carried along, and reset where an episode begins."""
-        td = rollout(batch, steps, ends=0.3)
+        td = rollout(batch, steps, ends=0.4, seed=seed)
         done = td["next", "done"]
         td["is_init"] = torch.cat([torch.ones(batch, 1, 1, dtype=torch.bool), done[:, :-1]], 1)
         td["next", "is_init"] = torch.zeros(batch, steps, 1, dtype=torch.bool)
@@ -373,15 +379,17 @@ class TestRecurrentCritics:
                 columns.append(step)
         return torch.stack(columns, 1).contiguous()
 
-    def test_equals_a_walk_through_time(self, rollout) -> None:
+    @pytest.mark.parametrize("seed", [1, 2])
+    def test_equals_a_walk_through_time(self, rollout, seed: int) -> None:
         critic = self.networks()
-        td = self.rollout(critic, rollout, 3, 6)
-        assert td["next", "done"][:, :-1].any()
+        td = self.rollout(critic, rollout, 3, 6, seed)
+        # episodes that begin with the last step, and that last one step
+        assert td["is_init"][:, -1].any()
+        assert (td["is_init"] & td["next", "done"])[:, :-1].any()
         walked = {key: td[key].clone() for key in ("state_value", "successor_features", "state_embedding")}
         with torch.no_grad(), set_recurrent_mode(False):
             following = critic(td["next"].exclude("next").reshape(-1).clone()).reshape(td.shape)
-        with set_recurrent_mode(True), set_exploration_type(None):
-            result = USFEstimator(value_network=critic, gamma=0.9, lmbda=0.8)(td.exclude(*walked))
+        result = USFEstimator(value_network=critic, gamma=0.9, lmbda=0.8)(td.exclude(*walked))
         tables = Mod(
             lambda i: tuple(
                 torch.cat([walked[key].reshape(18, -1), following[key].reshape(18, -1)])[i] for key in walked
@@ -395,6 +403,22 @@ class TestRecurrentCritics:
         expected = USFEstimator(value_network=tables, gamma=0.9, lmbda=0.8)(numbered)
         for key in ("advantage", "value_target", "successor_target"):
             torch.testing.assert_close(result[key], expected[key], rtol=1e-5, atol=1e-5)
+
+    def test_no_next_state_begins_an_episode(self) -> None:
+        """The step to it goes on from the root's hidden state, even where the root began an episode."""
+        seen = []
+
+        def look(state: Tensor, is_init: Tensor) -> Tensor:
+            seen.append((state.squeeze(-1).tolist(), is_init.squeeze(-1).tolist()))
+            return state.float()
+
+        critic = Mod(look, in_keys=["state", "is_init"], out_keys=["state_value"])
+        td = table_rollout(1, 3, seed=0, ends=0.0)
+        td["state"], td["next", "state"] = torch.tensor([[[0], [1], [2]]]), torch.tensor([[[7], [8], [9]]])
+        td["next", "done"][0, 0] = True
+        td["is_init"] = torch.ones(1, 3, 1, dtype=torch.bool)
+        USFEstimator(value_network=critic)(td)
+        assert seen == [([[0, 1, 2, 9]], [[True, True, True, False]]), ([[7]], [[False]])]
 
 
 class TestErrors:

@@ -342,7 +342,7 @@ class TestOtherActions:
         td = continuous_rollout()
         with set_composite_lp_aggregate(False):
             loss = USFLoss(actor, critic, functional=functional, reduction="none")
-            losses = loss(td)
+        losses = loss(td)
         dist = actor.get_dist(td.clone())
         if composite:
             parts = dist.dists

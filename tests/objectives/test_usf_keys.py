@@ -282,6 +282,21 @@ class TestEstimators:
         total(loss(td)).backward()
         assert all(p.grad is not None for p in loss.parameters())
 
+    @pytest.mark.parametrize("functional", [True, False])
+    def test_targets_are_constants_whatever_the_estimator(self, plain, rollout, functional: bool) -> None:
+        networks = plain()
+        td = rollout(3, 4)
+        loss = USFLoss(networks.actor, networks.critic, functional=functional)
+        constant = GAE(value_network=networks.critic, gamma=0.9, lmbda=0.9)(td.clone())
+        expected = torch.autograd.grad(loss(constant)["loss_critic"], networks.critic.parameters())
+        estimator = GAE(value_network=networks.critic, gamma=0.9, lmbda=0.9, differentiable=True)
+        loss.make_value_estimator(estimator)
+        losses = loss(td)
+        result = torch.autograd.grad(losses["loss_critic"], networks.critic.parameters(), retain_graph=True)
+        torch.testing.assert_close(result, expected)
+        losses["loss_objective"].backward()
+        assert all(p.grad is None for p in networks.critic.parameters())
+
     def test_targets_of_another_estimator_lack_the_successors(self, usf, rollout) -> None:
         networks = usf(variational=False)
         loss = USFLoss(networks.actor, networks.critic)

@@ -253,6 +253,9 @@ def gaussian_kl(loc: Tensor, scale: Tensor, eps: float = 1e-8) -> Tensor:
     tensor([0., 2.])
     """
     _assert_same_shape(gaussian_kl, loc=loc, scale=scale)
+    if loc.dtype in (torch.bfloat16, torch.float16):
+        # eps and the difference of near-equal numbers need more digits, as under autocast
+        loc, scale = loc.float(), scale.float()
     variance = scale.square()
     return 0.5 * (loc.square() + variance - torch.log(variance + eps) - 1.0)
 

@@ -287,7 +287,6 @@ class USFLoss(LossModule):
         tensordict = tensordict.clone(False)
         if tensordict.get(self.tensor_keys.advantage, None) is None:
             params = self.critic_network_params
-            params = params if params is None else params.detach()
             self.value_estimator(tensordict, params=params, target_params=params)
         results = self._evaluate(tensordict)
         out = TensorDict({}, batch_size=[])
