@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import os
 import zlib
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -14,34 +13,27 @@ import torch.multiprocessing
 
 from vusfa.scenes import Scene
 
-_BESIDE_THE_REPOSITORY = Path(__file__).parents[2] / "shared" / "golden"
+_RECORDED = Path(__file__).parent / "golden"
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption(
         "--golden",
         type=Path,
-        default=None,
+        default=_RECORDED,
         metavar="DIR",
         help="folder of numbers that the authors' released code computed, for tests/test_reference_parity.py;"
-        f" by default $VUSFA_GOLDEN, or {_BESIDE_THE_REPOSITORY} where it exists",
+        " by default tests/golden",
     )
 
 
 @pytest.fixture(scope="session")
 def golden(request: pytest.FixtureRequest) -> Path:
-    """The folder of golden numbers. A folder that was named must exist; without any, the test is skipped."""
-    named = request.config.getoption("--golden") or os.environ.get("VUSFA_GOLDEN")
-    if named:
-        folder = Path(named)
-        if not folder.is_dir():
-            pytest.fail(
-                f"{folder} is not a folder; --golden and $VUSFA_GOLDEN name the folder of golden numbers"
-            )
-        return folder
-    if not _BESIDE_THE_REPOSITORY.is_dir():
-        pytest.skip("no golden numbers here; name their folder with --golden DIR or $VUSFA_GOLDEN")
-    return _BESIDE_THE_REPOSITORY
+    """The folder of golden numbers."""
+    folder: Path = request.config.getoption("--golden")
+    if not folder.is_dir():
+        pytest.fail(f"{folder} is not a folder; --golden names the folder of golden numbers")
+    return folder
 
 
 def grid_scene(name: str = "hall", width: int = 2, height: int = 2, features: int = 8) -> Scene:
