@@ -189,6 +189,15 @@ class TestTargets:
         assert correlation[0, 1].item() == pytest.approx(1.0)
         torch.testing.assert_close(raw["value_target"], scaled["value_target"])
 
+    def test_small_advantages_are_not_blown_up(self) -> None:
+        td = table_rollout(8, 9, seed=0, ends=0.2)
+        raw = USFEstimator(value_network=table_critic())(td.clone())["advantage"]
+        floor = 10 * raw.std().item()
+        estimator = USFEstimator(
+            value_network=table_critic(), normalize_advantage=True, min_advantage_std=floor
+        )
+        torch.testing.assert_close(estimator(td)["advantage"], (raw - raw.mean()) / floor)
+
     def test_half_precision_of_the_critic_does_not_reach_the_sums(self) -> None:
         """A critic under autocast writes bfloat16; the returns are summed in the reward's precision."""
         critic = Mod(
@@ -428,6 +437,7 @@ class TestErrors:
             ({"gamma": 1.5}, "gamma is 1.5"),
             ({"lmbda": -0.1}, "lmbda is -0.1"),
             ({"n_steps": 0}, "n_steps is 0"),
+            ({"min_advantage_std": 0.0}, "min_advantage_std is 0.0"),
             ({"n_steps": 3, "lmbda": 0.9}, "n_steps is 3 with lmbda 0.9"),
             ({"embedding_at": "previous"}, "embedding_at is 'previous'"),
         ],

@@ -111,11 +111,11 @@ class USFEstimator(ValueEstimatorBase):
             )
         if embedding_at not in ("next", "current"):
             raise ValueError(f"USFEstimator: embedding_at is {embedding_at!r}; give 'next' or 'current'")
+        if not min_advantage_std > 0.0:
+            raise ValueError(f"USFEstimator: min_advantage_std is {min_advantage_std}; give a number above 0")
         self.gamma = gamma
         self.lmbda = lmbda
         self.n_steps = n_steps
-        if not min_advantage_std > 0.0:
-            raise ValueError(f"USFEstimator: min_advantage_std is {min_advantage_std}; give a number above 0")
         self.normalize_advantage = normalize_advantage
         self.min_advantage_std = min_advantage_std
         self.bootstrap_at_timeout = bootstrap_at_timeout
