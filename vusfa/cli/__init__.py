@@ -1,0 +1,40 @@
+"""The command line: ``vusfa scenes ...``.
+
+One module for each group of commands. Every one has a function ``register(scenes)`` that adds its commands
+to ``vusfa scenes``, and imports what computes (torch, matplotlib, a renderer) only inside them, so that
+``--help`` answers at once.
+"""
+
+from __future__ import annotations
+
+import signal
+import sys
+from collections.abc import Sequence
+
+__all__ = ["COMMANDS", "main"]
+
+#: Modules of this package that add commands, in the order in which ``--help`` shows them.
+COMMANDS = [
+    "inspect",
+    # "photos",
+]
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Run the command line and end the process.
+
+    Exit codes: 0 done, 1 an error that the user can mend (one line ``error: ...`` on stderr), 2 a wrong
+    command line, 130 Ctrl-C, 143 SIGTERM. Whatever ends a command, it leaves no half-written file.
+
+    Args:
+        arguments: without the program's name; the process's own by default.
+    """
+    # As an exception, so that temporary files are removed on the way out.
+    signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(128 + number))
+    try:
+        from vusfa.cli.app import app
+    except ModuleNotFoundError as error:
+        if error.name != "typer":
+            raise
+        sys.exit("error: the command line needs some more packages: pip install 'vusfa[scenes]'")
+    app(args=None if arguments is None else list(arguments), prog_name="vusfa")

@@ -1,0 +1,6 @@
+"""``python -m vusfa.cli``: the same as the script ``vusfa``."""
+
+from vusfa.cli import main
+
+if __name__ == "__main__":
+    main()

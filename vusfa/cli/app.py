@@ -1,0 +1,63 @@
+"""The application itself: what all commands have in common."""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import Annotated, Any
+
+import typer
+from typer.core import TyperGroup
+
+from vusfa import __version__
+from vusfa.cli import COMMANDS
+from vusfa.errors import VusfaError
+
+__all__ = ["app", "scenes"]
+
+
+class _Commands(TyperGroup):
+    """Turns what ends a command early into a line and an exit code, for every command alike."""
+
+    def invoke(self, ctx: Any) -> Any:
+        """Run the command that the context names."""
+        try:
+            return super().invoke(ctx)
+        except VusfaError as error:
+            typer.echo(f"error: {error}", err=True)
+            raise typer.Exit(1) from error
+        except KeyboardInterrupt as interrupt:
+            typer.echo("stopped", err=True)
+            raise typer.Exit(130) from interrupt
+
+
+_LOOKS: dict[str, Any] = {
+    "no_args_is_help": True,
+    "rich_markup_mode": "markdown",
+    "context_settings": {"help_option_names": ["-h", "--help"]},
+}
+
+#: ``vusfa``
+app = typer.Typer(cls=_Commands, pretty_exceptions_enable=False, **_LOOKS)
+#: ``vusfa scenes``: the commands of :data:`vusfa.cli.COMMANDS` are registered here
+scenes = typer.Typer(**_LOOKS)
+app.add_typer(scenes, name="scenes", help="Scenes: look at them, check them, make your own.")
+
+
+def _show_version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(f"vusfa {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def _vusfa(
+    version: Annotated[
+        bool,
+        typer.Option("--version", callback=_show_version, is_eager=True, help="Say which version it is."),
+    ] = False,
+) -> None:
+    """Target-driven visual navigation with universal successor features."""
+
+
+for _name in COMMANDS:
+    import_module(f"vusfa.cli.{_name}").register(scenes)
