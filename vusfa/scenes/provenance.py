@@ -1,0 +1,101 @@
+"""Where a scene comes from: who made it, with what, from which plan and seed, under which licences.
+
+These are attributes of the scene's file, one for each field of :class:`Provenance`; what is not known is
+left out. A scene carries them in :attr:`vusfa.scenes.Scene.attributes`, beside whatever else its maker wrote
+there.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass
+from datetime import datetime, timezone
+from typing import Any
+
+from vusfa import __version__
+
+__all__ = ["Provenance", "this_tool", "today"]
+
+
+@dataclass(frozen=True)
+class Provenance:
+    """What a scene's file says of its origin.
+
+    Args:
+        made_with: tools and their versions, as :func:`this_tool` writes them.
+        made_by: a person or a group.
+        made_on: a day, 2026-11-23.
+        plan: the plan the room was built from, as its YAML text, or where it can be found.
+        seed: of whatever was random.
+        licences: one line for each part that has a licence of its own.
+        credits: whom to name wherever the pictures are shown.
+
+    >>> origin = Provenance("vusfa 0.1.0 scenes from-photos", seed=3, credits=("Photographs: A. Fan",))
+    >>> origin.attributes()
+    {'made_with': 'vusfa 0.1.0 scenes from-photos', 'seed': 3, 'credits': ['Photographs: A. Fan']}
+    >>> Provenance.of(origin.attributes()) == origin
+    True
+    """
+
+    made_with: str | None = None
+    made_by: str | None = None
+    made_on: str | None = None
+    plan: str | None = None
+    seed: int | None = None
+    licences: tuple[str, ...] = ()
+    credits: tuple[str, ...] = ()
+
+    @classmethod
+    def of(cls, attributes: Mapping[str, Any]) -> Provenance:
+        """The origin that a scene's attributes tell; files of other programs may tell none.
+
+        >>> Provenance.of({"seed": 1, "licences": "CC0", "exposure": 2.2})
+        Provenance(made_with=None, ..., seed=1, licences=('CC0',), credits=())
+        """
+        known: dict[str, Any] = {name: attributes[name] for name in _NAMES if name in attributes}
+        for name in ("licences", "credits"):
+            if name in known:
+                value = known[name]
+                known[name] = tuple(map(str, value)) if isinstance(value, list | tuple) else (str(value),)
+        return cls(**known)
+
+    def attributes(self) -> dict[str, Any]:
+        """As attributes of a scene: ``Scene(..., attributes={**origin.attributes(), ...})``."""
+        written: dict[str, Any] = {}
+        for name in _NAMES:
+            value = getattr(self, name)
+            if value not in (None, ()):
+                written[name] = list(value) if isinstance(value, tuple) else value
+        return written
+
+    @staticmethod
+    def other(attributes: Mapping[str, Any]) -> dict[str, Any]:
+        """The attributes that are no part of the origin.
+
+        >>> Provenance.other({"seed": 1, "exposure": 2.2})
+        {'exposure': 2.2}
+        """
+        return {name: value for name, value in attributes.items() if name not in _NAMES}
+
+
+_NAMES = tuple(field.name for field in dataclasses.fields(Provenance))
+
+
+def this_tool(command: str, **versions: str) -> str:
+    """A value for ``made_with``: this package, the command, and what else had a part in it.
+
+    >>> this_tool("scenes render", mitsuba="3.9.1")
+    'vusfa ... scenes render, mitsuba 3.9.1'
+    """
+    return ", ".join([f"vusfa {__version__} {command}", *(f"{name} {of}" for name, of in versions.items())])
+
+
+def today() -> str:
+    """A value for ``made_on``: the day in UTC; that of $SOURCE_DATE_EPOCH where it is set, for files that
+    come out the same every time.
+    """
+    epoch = os.environ.get("SOURCE_DATE_EPOCH")
+    moment = datetime.now(timezone.utc) if epoch is None else datetime.fromtimestamp(int(epoch), timezone.utc)
+    return moment.strftime("%Y-%m-%d")
