@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import secrets
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -12,11 +12,11 @@ from typing import Any
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
-from torchrl.collectors import BaseCollector
+from torchrl.collectors import BaseCollector, Collector
 from torchrl.objectives import LossModule
 
 from vusfa.errors import CheckpointError, ConfigError
-from vusfa.modules import Agent, make_agent
+from vusfa.modules import Agent, frozen, make_agent
 from vusfa.scenes import SceneSet, bundled_names
 from vusfa.training.checkpoint import (
     check_scenes,
@@ -93,11 +93,23 @@ class Session:
                 load_collector_state(collector, self._waiting["collector"])
                 restore_random_state(self._waiting["rng"])  # last: what came before has drawn
                 self._waiting = {}
-            yield iter(collector)
+            yield self._batches(collector)
         finally:
             self._collector = None
             collector.shutdown()
             torch.set_num_threads(threads)
+
+    def _batches(self, collector: BaseCollector) -> Iterator[TensorDictBase]:
+        """The collector's batches. Where a batch has at least as many frames as the world has states,
+        encoding the whole world once before each batch is the shorter way; the weights stand still
+        meanwhile."""
+        here = isinstance(collector, Collector)
+        worthwhile = here and collector.requested_frames_per_batch >= self.scenes.num_states
+        batches = iter(collector)
+        while True:
+            with frozen(self.agent) if worthwhile else nullcontext():
+                batch = next(batches)
+            yield batch
 
     def count(self, batch: TensorDictBase, terms: Mapping[str, Tensor], seconds: float) -> None:
         """One update has been made.
