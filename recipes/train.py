@@ -31,6 +31,7 @@ from vusfa.training import (
     make_env,
     make_loggers,
     make_loss,
+    make_observation,
     make_optimiser,
     scene_sources,
     torch_device,
@@ -75,9 +76,10 @@ def train(cfg: DictConfig, overrides: list[str]) -> tuple[Session, Comparison | 
     if cfg.resume:
         for change in session.resume(cfg.resume):
             print(f"resumed with {change}", file=sys.stderr)
-    history = agent.config["history"]
-    env = partial(make_env, scenes, agent.make_env_transforms(), history=history, device=device)
-    env = partial(env, **{**plain["env"], "goals": goals})
+    history, task = agent.config["history"], {**plain["env"], "goals": goals}
+    observation = make_observation(agent, scenes, task.pop("crop"))
+    transforms = [*([observation] if observation is not None else []), *agent.make_env_transforms()]
+    env = partial(make_env, scenes, transforms, history=history, device=device, **task)
     collector = partial(
         make_collector, make_env=env, policy=actor, seed=cfg.seed, autocast=cfg.autocast, **plain["collector"]
     )
@@ -114,7 +116,7 @@ def train(cfg: DictConfig, overrides: list[str]) -> tuple[Session, Comparison | 
 
         result = None
         if cfg.evaluation.goals and not stop.received:
-            options = {**plain["evaluation"], "history": history}
+            options = {**plain["evaluation"], "history": history, "observe": observation}
             wanted = options.pop("goals")
             wanted = goals if wanted == "trained" else wanted
             result = compare({agent.config["model"]: actor}, scenes, wanted, trained=goals, **options)

@@ -18,7 +18,7 @@ from rich.progress import Progress
 
 from vusfa.errors import VusfaError
 from vusfa.evaluation import compare, print_summary
-from vusfa.training import load_agent, rebuild_agent
+from vusfa.training import load_agent, make_observation, rebuild_agent
 
 
 def zero_shot(
@@ -63,6 +63,7 @@ def zero_shot(
             episodes_per_goal=episodes,
             max_steps=max_steps,
             history=agent.config["history"],
+            observe=make_observation(agent, scenes),
             sample=not greedy,
             unreachable=unreachable,
             seed=seed,

@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from vusfa.evaluation import evaluate
-from vusfa.training import load_agent, load_checkpoint
+from vusfa.training import load_agent, load_checkpoint, make_observation
 
 MODELS = ("gvf", "usfa", "sfdp", "vusfa")
 
@@ -98,6 +98,8 @@ def test_a_run_learns_and_tells(recipe, settings, small, tmp_path: Path, capsys:
         ["autocast=true", "agent.model=vusfa"],
         ["agent=lstm", "agent.model=usfa"],
         ["agent=pixels", "agent.model=gvf", "agent.picture_size=[36,44]"],
+        ["agent.observation=features", "env.crop=random"],
+        ["agent.observation=pixels", "agent.picture_size=[36,44]"],
         ["preset=paper", "agent.model=sfdp", "collector.num_envs=6", "env.max_steps=20"],
         ["preset=reference", "agent.model=vusfa", "collector.num_envs=6"],
         ["env.goal_sampling=episode", "env.goals=all", "optim=rmsprop", "objective.lmbda=0.9"],
@@ -113,7 +115,8 @@ def test_options_train(recipe, settings, small, tmp_path: Path, options: list[st
     assert session.updates == 20
     assert all(bool(param.isfinite().all()) for param in session.agent.parameters())
     agent, scenes, _ = load_agent(tmp_path / "run" / "checkpoint.pt")
-    evaluate(agent.get_policy_operator(), scenes, [3], max_steps=9, history=agent.config["history"])
+    history, observe = agent.config["history"], make_observation(agent, scenes)
+    evaluate(agent.get_policy_operator(), scenes, [3], max_steps=9, history=history, observe=observe)
 
 
 @pytest.mark.filterwarnings("default")  # TensorBoard and wandb themselves

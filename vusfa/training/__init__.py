@@ -9,7 +9,14 @@ from vusfa.training.learning import annealed, descend, make_loss, make_optimiser
 from vusfa.training.loggers import make_loggers
 from vusfa.training.metrics import EpisodeMeter, MeanMeter
 from vusfa.training.progress import ProgressLine
-from vusfa.training.session import Session, load_agent, rebuild_agent, scene_sources, torch_device
+from vusfa.training.session import (
+    Session,
+    load_agent,
+    make_observation,
+    rebuild_agent,
+    scene_sources,
+    torch_device,
+)
 from vusfa.training.signals import StopOnSignal
 
 __all__ = [
@@ -27,6 +34,7 @@ __all__ = [
     "make_env",
     "make_loggers",
     "make_loss",
+    "make_observation",
     "make_optimiser",
     "rebuild_agent",
     "save_checkpoint",

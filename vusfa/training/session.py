@@ -15,6 +15,7 @@ from torch import Tensor
 from torchrl.collectors import BaseCollector, Collector
 from torchrl.objectives import LossModule
 
+from vusfa.envs import SceneObservation
 from vusfa.errors import CheckpointError, ConfigError
 from vusfa.modules import Agent, frozen, make_agent
 from vusfa.scenes import SceneSet, bundled_names
@@ -31,7 +32,7 @@ from vusfa.training.learning import loss_state
 from vusfa.training.loggers import flat
 from vusfa.training.metrics import EpisodeMeter, MeanMeter
 
-__all__ = ["Session", "load_agent", "rebuild_agent", "scene_sources", "torch_device"]
+__all__ = ["Session", "load_agent", "make_observation", "rebuild_agent", "scene_sources", "torch_device"]
 
 # entries of Agent.config that describe the scenes, not the agent
 _OF_SCENES = ("scenes", "fingerprint", "num_actions")
@@ -209,6 +210,27 @@ def scene_sources(scenes: str | Sequence[str]) -> list[str]:
     """
     given = [scenes] if isinstance(scenes, str) else list(scenes)
     return [name if name in bundled_names() else str(Path(name).resolve()) for name in given]
+
+
+def make_observation(agent: Agent, scenes: SceneSet, crop: str = "first") -> SceneObservation | None:
+    """What stands between the world and an agent that is handed features or pixels; None for one that reads
+    ids.
+
+    Args:
+        agent: the agent.
+        scenes: the world.
+        crop: of :class:`~vusfa.envs.SceneObservation`, for features.
+
+    >>> scenes = SceneSet.bundled(["bathroom"])
+    >>> make_observation(make_agent("gvf", scenes=scenes, observation="features"), scenes).kind
+    'features'
+    """
+    kind = agent.config["observation"]
+    if kind == "index":
+        return None
+    if kind == "features":
+        return SceneObservation(scenes, "features", crop=crop)
+    return SceneObservation(scenes, "pixels", size=tuple(agent.config["picture_size"]))
 
 
 def torch_device(name: str) -> torch.device:

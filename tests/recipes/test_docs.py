@@ -1,0 +1,41 @@
+"""The command lines in the documentation are ones that work."""
+
+from __future__ import annotations
+
+import inspect
+import re
+import shlex
+from pathlib import Path
+
+import pytest
+
+from vusfa.training.launch import compose
+
+ROOT = Path(__file__).parents[2]
+PAGES = [path for path in (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))) if path.is_file()]
+LINES = [
+    pytest.param(line, id=f"{page.name}: {line}")
+    for page in PAGES
+    for line in re.findall(r"(?:^|`)(python recipes/[^`\n]*)", page.read_text(), re.MULTILINE)
+]
+
+
+def test_there_are_some():
+    assert len(LINES) >= 3
+
+
+@pytest.mark.parametrize("line", LINES)
+def test_a_recipe_line_is_one_that_works(recipe, line: str):
+    _, script, *arguments = shlex.split(line.partition(" #")[0])
+    name = Path(script).stem
+    assert (ROOT / script).is_file()
+    if name == "zero_shot":
+        known = inspect.signature(recipe(name).zero_shot).parameters
+        assert {word[2:].replace("-", "_") for word in arguments if word.startswith("--")} <= known.keys()
+        return
+    given = [word for word in arguments if not word.startswith("--")]
+    for override in given:
+        key, _, values = override.partition("=")
+        # a sweep is several command lines
+        for value in values.split(",") if "--multirun" in arguments else [values]:
+            compose(ROOT / "recipes" / "conf", name, [f"{key}={value}"])
