@@ -6,6 +6,7 @@ import csv
 import json
 import math
 import os
+import time
 from pathlib import Path
 
 import pytest
@@ -106,9 +107,13 @@ def test_wandb_offline(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     assert log.run.id == "abc12345"
     log.close()
     (stored,) = (tmp_path / "run" / "wandb").glob("offline-run-*/run-abc12345.wandb")
+    words = (b"checkpoint-abc12345", b"evaluation", b"goal/hall/3/success")
+    # wandb's service writes the file, in a process of its own, and on a busy machine some seconds late
+    deadline = time.monotonic() + 60.0
+    while not all(word in stored.read_bytes() for word in words) and time.monotonic() < deadline:
+        time.sleep(0.2)
     content = stored.read_bytes()
-    for word in (b"checkpoint-abc12345", b"evaluation", b"goal/hall/3/success"):
-        assert word in content
+    assert [word for word in words if word not in content] == []
     monkeypatch.delenv("WANDB_DATA_DIR", raising=False)
     os.environ.pop("WANDB_DATA_DIR", None)
 
