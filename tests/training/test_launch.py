@@ -23,7 +23,7 @@ def conf(tmp_path: Path) -> Path:
         "defaults: [{optim: adam}, _self_, {override hydra/job_logging: none},"
         " {override hydra/hydra_logging: none}]\n"
         "seed: 0\nhalf: ${seed}\nverbose: false\nresume: null\n"
-        "hydra: {output_subdir: null, run: {dir: .}}\n"
+        "hydra:\n  output_subdir: null\n  run: {dir: .}\n"
     )
     return folder
 
@@ -101,6 +101,22 @@ def test_our_errors_are_one_line_and_bugs_are_not(run, capsys: pytest.CaptureFix
     code, text = run(job=interrupted)
     assert code == 130
     assert text.startswith("error: interrupted")
+
+
+def test_every_run_of_a_sweep_has_its_folder(run, conf: Path):
+    (conf / "main.yaml").write_text(
+        (conf / "main.yaml").read_text().replace("seed: 0\n", "seed: 0\nfolder: here\n")
+        + "  sweep: {dir: ../sweep, subdir: '${hydra.job.num}'}\n"
+    )
+    folders = []
+
+    def job(cfg, overrides):
+        folders.append(Path(cfg.folder).name)
+        return len(folders)
+
+    assert run("--multirun", "seed=1,2", job=job)[0] == 2
+    assert run("--multirun", "seed=1,2", "folder=mine", job=job)[0] == 4
+    assert folders == ["0", "1", "mine", "mine"]
 
 
 def test_compose_is_what_the_command_line_would_be(conf: Path):

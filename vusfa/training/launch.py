@@ -24,6 +24,7 @@ import hydra
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException, MissingConfigException, OverrideParseException
+from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
@@ -97,7 +98,7 @@ def with_saved_overrides(arguments: Sequence[str]) -> list[str]:
     paths = [argument.partition("=")[2] for argument in arguments if argument.startswith("resume=")]
     if not paths or paths[-1] in ("", "null"):
         return list(arguments)
-    given = {"folder", *(argument.partition("=")[0].lstrip("+~") for argument in arguments)}
+    given = {"folder", *_keys(arguments)}
     saved = load_checkpoint(paths[-1]).get("overrides", [])
     kept = [override for override in saved if override.partition("=")[0].lstrip("+~") not in given]
     return [*kept, f"folder='{Path(paths[-1]).resolve().parent}'", *arguments]
@@ -146,6 +147,10 @@ def explain(error: Exception, folder: Path, name: str) -> str:
     return text
 
 
+def _keys(overrides: Iterable[str]) -> set[str]:
+    return {override.partition("=")[0].lstrip("+~") for override in overrides}
+
+
 def _near(word: str, choices: Iterable[str]) -> str:
     choices = list(choices)
     near = difflib.get_close_matches(word, choices, n=1, cutoff=0.5)
@@ -160,7 +165,11 @@ def _settled(cfg: DictConfig, folder: Path, name: str) -> DictConfig:
     if model is not None:
         resolve_config(model)  # before anything is looked up by the model's name
     OmegaConf.resolve(cfg)
-    choices = HydraConfig.get().runtime.choices
+    context = HydraConfig.get()
+    if context.mode == RunMode.MULTIRUN and "folder" in cfg and "folder" not in _keys(context.overrides.task):
+        # runs of one sweep may differ in what their folder's name does not tell, and begin in the same second
+        cfg.folder = context.runtime.output_dir
+    choices = context.runtime.choices
     groups = [f"{group}={choice}" for group, choice in choices.items() if not group.startswith("hydra/")]
     defaults = compose(folder, name, [*groups, *([f"agent.model={model}"] if model is not None else [])])
     OmegaConf.resolve(defaults)
