@@ -7,8 +7,8 @@ Three ways, ``crops=``:
 - ``centre``: the shorter side is resized to ``resize``, and the square in the middle is cut out: how
   networks trained on ImageNet are tested.
 - ``ten``: of the same resized picture the centre, the top left, top right, bottom left and bottom right
-  corner, and then these five mirrored: ten rows of features a state, of which training draws one. The THOR v1 dumps
-  have ten crops; their order is not known, ours is this one.
+  corner, and then these five mirrored: ten rows of features a state, of which training draws one. The
+  THOR v1 dumps have ten crops; their order is not known, ours is this one.
 """
 
 from __future__ import annotations
