@@ -1,18 +1,228 @@
-"""``vusfa scenes check``."""
+"""``vusfa scenes list``, ``show`` and ``check``: look at scenes that are there."""
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from vusfa.errors import SceneError
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+    from vusfa.scenes import Scene
+    from vusfa.scenes.summary import Summary
+
 __all__ = ["register"]
+
+_ENDINGS = (".h5", ".hdf5")
 
 
 def register(scenes: typer.Typer) -> None:
     """Add the commands to ``vusfa scenes``."""
+    scenes.command("list")(list_scenes)
+    scenes.command("show")(show)
     scenes.command("check")(check)
+
+
+def list_scenes(
+    sources: Annotated[
+        list[str] | None,
+        typer.Argument(help="Bundled names, scene files, folders of them.", metavar="SCENE|DIR..."),
+    ] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Write JSON instead of a table.")] = False,
+    walk_steps: Annotated[int, typer.Option(min=0, help="Actions that the random walk has.")] = 500,
+) -> None:
+    """List scenes: how large they are, how far their ways, how well a random walk does.
+
+    Without arguments: the bundled rooms and the scene files of the current folder. Success of the random walk
+    is exact, the mean over all goals and all starts that can reach them. Exit code 1 if a file has faults.
+
+    Examples:
+
+        vusfa scenes list
+        vusfa scenes list bathroom my_rooms/ other.h5
+        vusfa scenes list --json | jq '.[].random_walk'
+    """
+    from vusfa.cli.progress import progress
+    from vusfa.scenes import Scene, bundled_names
+    from vusfa.scenes.store import bundled_path
+    from vusfa.scenes.summary import summarise
+
+    bundled = {name: bundled_path(name) for name in bundled_names()}
+    paths = _find(sources, bundled)
+    rows: list[tuple[Path, Summary | SceneError]] = []
+    with progress("measuring", len(paths), "scenes") as advance:
+        for path in paths:
+            try:
+                rows.append((path, summarise(Scene.load(path), walk_steps)))
+            except SceneError as error:
+                rows.append((path, error))
+            advance()
+    labels = {path: "bundled" if path in bundled.values() else str(path) for path in paths}
+    if as_json:
+        typer.echo(json.dumps([_as_json(labels[path], found) for path, found in rows], indent=2))
+    else:
+        _print_wide(_as_table([(labels[path], found) for path, found in rows], walk_steps))
+    faulty = [found for _, found in rows if isinstance(found, SceneError)]
+    for fault in faulty:
+        typer.echo(f"error: {fault}", err=True)
+    if faulty:
+        raise typer.Exit(1)
+
+
+def _find(sources: list[str] | None, bundled: dict[str, Path]) -> list[Path]:
+    """Files that the arguments mean, each once."""
+    found: dict[Path, None] = {}
+    if not sources:
+        found.update(dict.fromkeys(bundled.values()))
+        found.update(dict.fromkeys(_in_folder(Path())))
+    for source in sources or ():
+        path = Path(source)
+        if source in bundled:
+            found[bundled[source]] = None
+        elif path.is_dir():
+            inside = _in_folder(path)
+            if not inside:
+                raise SceneError(f"{path}: has no scene files in it; they end in {' or '.join(_ENDINGS)}")
+            found.update(dict.fromkeys(inside))
+        elif path.is_file() or path.suffix:
+            found[path] = None
+        else:
+            raise SceneError(
+                f"{source!r} is neither a bundled scene ({', '.join(bundled)}) nor a file or folder; check"
+                f" the name"
+            )
+    return list(found)
+
+
+def _in_folder(folder: Path) -> list[Path]:
+    """Files that may be scenes; HDF5 files of other programs, without a graph, are passed over."""
+    import h5py
+
+    found = []
+    for path in sorted(folder.iterdir()):
+        if path.suffix not in _ENDINGS or not path.is_file() or path.name.startswith("."):
+            continue
+        try:
+            with h5py.File(path, "r") as file:
+                is_scene = "graph" in file
+        except OSError:
+            is_scene = True  # or was: its fault will be said
+        if is_scene:
+            found.append(path)
+    return found
+
+
+def _as_json(label: str, found: Summary | SceneError) -> dict[str, Any]:
+    if isinstance(found, SceneError):
+        return {"file": label, "error": str(found)}
+    return {"file": label, **found.plain()}
+
+
+def _as_table(rows: list[tuple[str, Summary | SceneError]], walk_steps: int) -> Table:
+    from rich.table import Table
+    from rich.text import Text
+
+    table = Table()
+    table.add_column("scene")
+    for column in ("states", "cells", "actions", "features", "islands"):
+        table.add_column(column, justify="right")
+    table.add_column(f"random walk,\n{walk_steps} steps", justify="right")
+    table.add_column("mean\npath", justify="right")
+    table.add_column("longest\npath", justify="right")
+    table.add_column("pictures", justify="right")
+    table.add_column("file", overflow="fold")
+    for label, found in rows:
+        if isinstance(found, SceneError):
+            table.add_row(Text("faulty", "red"), *[""] * 9, Text(label))
+            continue
+        height, width = found.picture_shape[:2] if found.picture_shape else (0, 0)
+        crops = f"{found.crops} x " if found.crops > 1 else ""
+        table.add_row(
+            Text(found.name),
+            *(str(number) for number in (found.states, found.cells, found.actions)),
+            f"{crops}{found.features}",
+            str(found.islands),
+            f"{100 * found.random_walk:.1f} %",
+            f"{found.mean_path:.1f}",
+            str(found.longest_path),
+            f"{width} x {height}" if found.picture_shape else "none",
+            Text(label),
+        )
+    return table
+
+
+def _print_wide(table: Table) -> None:
+    """In a file or a pipe a table is as wide as it needs to be."""
+    from rich.console import Console
+
+    console = Console()
+    if not console.is_terminal:
+        console = Console(width=max(console.width, console.measure(table).maximum, 200))
+    console.print(table)
+
+
+def show(
+    scene: Annotated[str, typer.Argument(help="Bundled name or scene file.", show_default=False)],
+    output: Annotated[
+        Path | None, typer.Option("--output", "-o", help="The PNG; by default the scene's name with .png.")
+    ] = None,
+    pictures: Annotated[int, typer.Option(min=1, max=100, help="How many pictures to show.")] = 12,
+) -> None:
+    """Draw a scene as one PNG, pictures and floor map with all poses, and print where it comes from.
+
+    The pictures are taken from all over the room; their numbers are on the map, where +Z is up, every pose is
+    a dart that points where it looks, and poses on islands are red.
+
+    Examples:
+
+        vusfa scenes show kitchen
+        vusfa scenes show my_room.h5 -o my_room.png --pictures 20
+    """
+    from vusfa.scenes import SceneSet
+    from vusfa.scenes.sheet import save_sheet
+    from vusfa.scenes.summary import summarise
+
+    (loaded,) = SceneSet.open(scene).scenes
+    for line in _description(loaded, summarise(loaded)):
+        typer.echo(line)
+    typer.echo(f"drawn: {save_sheet(loaded, output or Path(f'{loaded.name}.png'), pictures)}")
+
+
+def _description(scene: Scene, summary: Summary) -> list[str]:
+    """The scene's numbers, its origin, and its other attributes, a line each."""
+    from vusfa.scenes.provenance import Provenance
+
+    lines = [
+        f"{scene.name}: {summary.states} states in {summary.cells} places, islands: {summary.islands}",
+        f"actions: {', '.join(scene.actions)}",
+        f"features: {summary.features} of each crop, crops: {summary.crops}",
+        f"shortest paths: mean {summary.mean_path:.1f}, longest {summary.longest_path} actions",
+        f"random walk: {100 * summary.random_walk:.1f} % success in {summary.walk_steps} actions",
+    ]
+    origin = Provenance.of(scene.attributes).attributes()
+    lines += ["origin:" + ("" if origin else " not told")]
+    lines += _indented(origin)
+    other = Provenance.other(scene.attributes)
+    if other:
+        lines += ["other attributes:", *_indented(other)]
+    return lines
+
+
+def _indented(attributes: dict[str, Any]) -> list[str]:
+    lines = []
+    for name, value in attributes.items():
+        parts = value if isinstance(value, list) else str(value).splitlines()
+        label = name.replace("_", " ")
+        if len(parts) == 1:
+            lines.append(f"  {label}: {parts[0]}")
+        else:
+            lines += [f"  {label}:", *(f"    {part}" for part in parts)]
+    return lines
 
 
 def check(
@@ -28,13 +238,17 @@ def check(
         vusfa scenes check room.h5
         vusfa scenes check dumps/*.h5
     """
+    from vusfa.cli.progress import progress
     from vusfa.scenes import validate
 
-    faulty = 0
-    for path in files:
-        faults = validate(path)
-        faulty += bool(faults)
+    found = {}
+    with progress("checking", len(files), "files") as advance:
+        for path in files:
+            found[path] = validate(path)
+            advance()
+    for path, faults in found.items():
         typer.echo("\n".join(faults) if faults else f"{path}: sound")
+    faulty = sum(map(bool, found.values()))
     if faulty:
-        typer.echo(f"{faulty} of {len(files)} files have faults", err=True)
+        typer.echo(f"error: {faulty} of {len(found)} files have faults", err=True)
         raise typer.Exit(1)

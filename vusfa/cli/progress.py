@@ -14,6 +14,7 @@ from rich.text import Text
 __all__ = ["progress", "time_to_go"]
 
 _EVERY = 10.0  # seconds between two lines where the output is not a terminal
+_BRIEF = 2.0  # seconds of work that need no line there at all
 
 
 @contextmanager
@@ -48,7 +49,8 @@ def progress(
             done += n
             bar.advance(task, n)
             now = time.monotonic()
-            if not console.is_terminal and (now - printed >= _EVERY or (done >= total and n)):
+            at_last = done >= total and now - began >= _BRIEF
+            if not console.is_terminal and (now - printed >= _EVERY or at_last):
                 printed = now
                 rate = done / (now - began) if now > began else math.nan
                 console.print(

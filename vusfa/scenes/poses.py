@@ -1,0 +1,63 @@
+"""What a scene's poses say: how far apart its places are, and which poses show most of the room."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+__all__ = ["places", "spread_poses", "step_length"]
+
+
+def places(location: Tensor) -> Tensor:
+    """The distinct places (P, 2) among the locations (N, 2) of poses."""
+    return location.unique(dim=0)
+
+
+def step_length(location: Tensor) -> float:
+    """Distance between neighbouring places, in the unit of ``location`` (N, 2); 1 where all are one place.
+
+    >>> step_length(torch.tensor([[0.0, 0.0], [0.0, 0.5], [1.0, 0.5], [0.0, 0.5]]))
+    0.5
+    """
+    distinct = places(location)
+    if len(distinct) == 1:
+        return 1.0
+    # the other mode, by matrix products, finds places 2 mm from themselves
+    apart = torch.cdist(distinct[:256], distinct, compute_mode="donot_use_mm_for_euclid_dist")
+    return float(apart[apart > 1e-3].min())
+
+
+def spread_poses(location: Tensor, rotation: Tensor, count: int) -> list[int]:
+    """States whose poses lie far from one another, in place and in heading: what to show of a room.
+
+    The first is the one nearest to the middle; each further one is the pose that is farthest from all before
+    it. Opposite headings count as far apart as half of the room.
+
+    Args:
+        location: (N, 2) metres.
+        rotation: (N,) degrees.
+        count: how many; all of them when there are fewer.
+
+    Returns:
+        state ids in the order of their choice, no repeats.
+
+    >>> row = torch.tensor([[0.0, 0.0], [0.0, 1.0], [0.0, 2.0], [0.0, 3.0], [0.0, 4.0]])
+    >>> spread_poses(row, torch.zeros(5), 3)
+    [2, 0, 4]
+    """
+    extent = float((location.amax(0) - location.amin(0)).max()) or 1.0
+    angle = rotation * (math.pi / 180)
+    # a unit vector for each heading, so that 0 and 360 are the same; opposite ones are 2 apart
+    heading = torch.stack([angle.sin(), angle.cos()], 1) * (extent / 4)
+    pose = torch.cat([location, heading], 1).double()
+    middle = torch.cat([location.mean(0), heading[0]]).double()
+    chosen = [int((pose - middle).norm(dim=1).argmin())]
+    nearest = (pose - pose[chosen[0]]).norm(dim=1)
+    while len(chosen) < min(count, len(pose)):
+        # never one that was chosen, even where several states share a pose
+        nearest[chosen] = -1.0
+        chosen.append(int(nearest.argmax()))
+        nearest = torch.minimum(nearest, (pose - pose[chosen[-1]]).norm(dim=1))
+    return chosen
