@@ -16,7 +16,7 @@ __all__ = ["COMMANDS", "main"]
 #: Modules of this package that add commands, in the order in which ``--help`` shows them.
 COMMANDS = [
     "inspect",
-    # "photos",
+    "photos",
 ]
 
 

@@ -209,14 +209,17 @@ def _description(scene: Scene, summary: Summary) -> list[str]:
     lines += _indented(origin)
     other = Provenance.other(scene.attributes)
     if other:
-        lines += ["other attributes:", *_indented(other)]
+        lines += ["other attributes:", *_indented(other, longest=20)]
     return lines
 
 
-def _indented(attributes: dict[str, Any]) -> list[str]:
+def _indented(attributes: dict[str, Any], longest: int | None = None) -> list[str]:
+    """Attributes by name, those of several lines below it, and of no more than ``longest``."""
     lines = []
     for name, value in attributes.items():
         parts = value if isinstance(value, list) else str(value).splitlines()
+        if longest is not None and len(parts) > longest:
+            parts = [*parts[:3], f"... ({len(parts)} lines)"]
         label = name.replace("_", " ")
         if len(parts) == 1:
             lines.append(f"  {label}: {parts[0]}")

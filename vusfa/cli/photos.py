@@ -1,0 +1,185 @@
+"""``vusfa scenes from-photos``."""
+
+from __future__ import annotations
+
+import hashlib
+import io
+from enum import Enum
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from vusfa.errors import SceneError
+
+if TYPE_CHECKING:
+    import numpy as np
+
+__all__ = ["register"]
+
+
+class Store(str, Enum):
+    """How a scene file keeps its pictures."""
+
+    JPEG = "jpeg"
+    RAW = "raw"
+
+
+def register(scenes: typer.Typer) -> None:
+    """Add the command to ``vusfa scenes``."""
+    scenes.command("from-photos")(from_photos)
+
+
+def from_photos(
+    folder: Annotated[Path, typer.Argument(help="Photographs, JPEG or PNG.", show_default=False)],
+    output: Annotated[
+        Path | None, typer.Option("--output", "-o", help="Scene file; by default the folder's name with .h5.")
+    ] = None,
+    poses: Annotated[
+        Path | None, typer.Option(help="CSV file,x,z,heading; by default poses.csv in the folder.")
+    ] = None,
+    edges: Annotated[
+        Path | None, typer.Option(help="CSV state,action,next; by default edges.csv in the folder.")
+    ] = None,
+    step: Annotated[
+        float | None, typer.Option(help="Metres between neighbouring places; inferred when not given.")
+    ] = None,
+    turn: Annotated[
+        int | None,
+        typer.Option(help="Degrees between headings, 45, 90, 180 or 360; inferred when not given."),
+    ] = None,
+    size: Annotated[str, typer.Option(help="WIDTHxHEIGHT that the pictures are made.")] = "200x150",
+    store: Annotated[Store, typer.Option(help="How the pictures are kept.")] = Store.JPEG,
+    features: Annotated[
+        Path | None, typer.Option(help="Features you have: .npy, (N, F) or (N, C, F), in the table's order.")
+    ] = None,
+    backbone: Annotated[
+        str, typer.Option(help="Network that computes features otherwise; see `vusfa scenes encode --help`.")
+    ] = "efficientnet-lite0",
+    weights: Annotated[Path | None, typer.Option(help="Its weights, where they are a file of yours.")] = None,
+    name: Annotated[str | None, typer.Option(help="The scene's name; by default the file's.")] = None,
+    by: Annotated[str | None, typer.Option(help="Who took the photographs.")] = None,
+    licence: Annotated[list[str] | None, typer.Option(help="Licence; may be given more than once.")] = None,
+    credit: Annotated[list[str] | None, typer.Option(help="Whom to name; more than once.")] = None,
+    force: Annotated[bool, typer.Option("--force", help="Replace the scene file if there is one.")] = False,
+) -> None:
+    """Make a scene of photographs that were taken at known poses.
+
+    poses.csv says where: `file,x,z,heading`, metres and degrees, 0 looks along +Z, 90 along +X. Poses on a
+    grid, a quarter of a step off at most, are joined by MoveForward, RotateRight, RotateLeft and
+    MoveBackward. For anything else, or where a wall stands between two poses, edges.csv says which action
+    leads where: `state,action,next`, with the pictures' names as states; poses are optional then.
+
+    Stopped while it computes features, it goes on where it was when the same command is given again.
+
+    Examples:
+
+        vusfa scenes from-photos my_flat/
+
+        vusfa scenes from-photos my_flat/ -o flat.h5 --by "A. Fan" --licence CC-BY-4.0
+
+        vusfa scenes from-photos lab/ --edges moves.csv --features lab.npy
+    """
+    import torch
+
+    from vusfa.cli.progress import progress
+    from vusfa.scenes import Scene
+    from vusfa.scenes.photos import lay_out, read_features, read_photos
+    from vusfa.scenes.provenance import Provenance, this_tool, today
+
+    target = output or Path(f"{folder.resolve().name}.h5")
+    if target.exists() and not force:
+        raise SceneError(f"{target}: exists; choose another name with -o, or replace it with --force")
+    width, height = _size(size)
+    layout = lay_out(folder, poses, edges, step=step, turn=turn)
+    given = None if features is None else read_features(features, len(layout.files))
+    network = None if given is not None else _network(backbone, weights)
+    with progress("reading pictures", len(layout.files), "pictures") as advance:
+        pictures = read_photos(folder, layout.files, width, height, raw=store == Store.RAW, advance=advance)
+    origin = Provenance(
+        this_tool("scenes from-photos"),
+        by,
+        today(),
+        licences=tuple(licence or ()),
+        credits=tuple(credit or ()),
+    )
+    # One text: HDF5 has room for some thousand only where they are a list.
+    attributes: dict[str, Any] = {**origin.attributes(), "photographs": "\n".join(layout.files)}
+    log = None
+    if given is None:
+        given, told, log = _encode(pictures, network, target)
+        attributes |= told
+    else:
+        attributes["feature"] = f"given, {features.name if features else ''}"
+    scene = Scene(
+        name or target.stem,
+        torch.from_numpy(layout.graph),
+        torch.from_numpy(given),
+        torch.from_numpy(layout.location),
+        torch.from_numpy(layout.rotation),
+        actions=layout.actions,
+        attributes=attributes,
+    )
+    scene.save(target, pictures)
+    if log is not None:
+        log.remove()
+    typer.echo(f"{target}: {scene.num_states} states, {layout.found}")
+    _warn(layout.left_out, scene)
+
+
+def _size(size: str) -> tuple[int, int]:
+    """
+    >>> _size("200x150")
+    (200, 150)
+    """
+    width, _, height = size.partition("x")
+    if not (width.isdecimal() and height.isdecimal() and 0 < int(width) <= 4096 and 0 < int(height) <= 4096):
+        raise SceneError(f"--size is {size!r}; write WIDTHxHEIGHT in pixels, 200x150")
+    return int(width), int(height)
+
+
+def _network(backbone: str, weights: Path | None) -> Any:
+    """The network; asked for before the pictures are read, so that a missing one is said at once."""
+    from vusfa.scenes.backbones import load_backbone
+
+    return load_backbone(backbone, weights=weights)
+
+
+def _encode(
+    pictures: np.ndarray | list[bytes], network: Any, target: Path
+) -> tuple[np.ndarray, dict[str, str], Any]:
+    """Features of the pictures as the scene will have them, what to say of them, and the log to remove."""
+    import numpy as np
+    from PIL import Image
+
+    from vusfa.cli.resumed import resumed
+    from vusfa.scenes.encode import encode_in_steps
+
+    def read(first: int, last: int) -> np.ndarray:
+        some = [
+            picture if isinstance(picture, np.ndarray) else np.asarray(Image.open(io.BytesIO(picture)))
+            for picture in pictures[first:last]
+        ]
+        return np.stack(some)
+
+    digest = hashlib.sha256()
+    for picture in pictures:
+        digest.update(picture)
+    log = target.with_name(f".{target.name}.encode")
+    with resumed("encoding", "pictures") as report:
+        work = {"pictures": digest.hexdigest()}
+        return encode_in_steps(read, len(pictures), network, log, work, progress=report)
+
+
+def _warn(left_out: tuple[str, ...], scene: Any) -> None:
+    """What may be an oversight."""
+    if left_out:
+        some = ", ".join(left_out[:3]) + (", ..." if len(left_out) > 3 else "")
+        typer.echo(f"note: {len(left_out)} pictures are in no table and were left out: {some}", err=True)
+    if scene.islands:
+        cut_off = sum(map(len, scene.islands))
+        typer.echo(
+            f"note: {cut_off} states are cut off from the others, on {len(scene.islands)} islands;"
+            f" see them in red: vusfa scenes show",
+            err=True,
+        )
