@@ -54,6 +54,17 @@ def in_session(rooms: SceneSet, agent: Agent, make: Callable[[], BaseCollector])
     return Session(rooms, GOALS, agent, loss, torch.optim.Adam(agent.parameters()), {}).collecting(make)
 
 
+class Kept:
+    """Makes a collector and keeps hold of it, as an exception's traceback would."""
+
+    def __init__(self, *arguments, **settings) -> None:
+        self.make = partial(open_collector, *arguments, **settings)
+
+    def __call__(self) -> BaseCollector:
+        self.collector = self.make()
+        return self.collector
+
+
 def prefer(agent: Agent, action: int) -> None:
     """Make the agent always do the same."""
     with torch.no_grad():
@@ -78,7 +89,7 @@ def test_workers_in_step(rooms: SceneSet):
     walked = []
     for _ in range(2):
         agent = untrained(rooms)
-        make = partial(open_collector, "multi_sync", rooms, agent, num_envs=4)
+        make = Kept("multi_sync", rooms, agent, num_envs=4)
         with in_session(rooms, agent, make) as batches:
             batch = next(batches).clone()
             assert batch.shape == (4, 4)
@@ -87,6 +98,9 @@ def test_workers_in_step(rooms: SceneSet):
             prefer(agent, 2)
             next(batches)  # under way when the weights changed, or not
             assert next(batches)["action"].unique().tolist() == [2]
+        assert not any(process.is_alive() for process in make.collector.procs if not process._closed)
+        # or the interpreter would hang on its way out
+        assert make.collector._weight_sync_schemes["policy"]._instruction_queues == {}
     assert bool((walked[0] == walked[1]).all())
     assert torch.get_num_threads() == threads
 

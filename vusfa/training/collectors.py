@@ -31,6 +31,7 @@ from vusfa.training.signals import ignore_interrupts
 __all__ = [
     "KINDS",
     "check_goals_dealt",
+    "close_collector",
     "collector_state",
     "load_collector_state",
     "make_collector",
@@ -171,6 +172,15 @@ def _begin_worker(autocast: bool) -> None:
         torch.set_autocast_enabled("cpu", True)
         # The cache would keep weights converted before an update for as long as the worker lives.
         torch.set_autocast_cache_enabled(False)
+
+
+def close_collector(collector: BaseCollector) -> None:
+    """End a collector's processes."""
+    collector.shutdown()
+    # Left to the garbage collector, the sharing of weights ends when the interpreter does, where it starts a
+    # thread and waits for it forever. An exception's traceback is enough to keep it alive that long.
+    for scheme in (collector._weight_sync_schemes or {}).values():
+        scheme.shutdown()
 
 
 def collector_state(collector: BaseCollector) -> dict[str, Any]:

@@ -27,7 +27,7 @@ from vusfa.training.checkpoint import (
     restore_random_state,
     save_checkpoint,
 )
-from vusfa.training.collectors import collector_state, load_collector_state
+from vusfa.training.collectors import close_collector, collector_state, load_collector_state
 from vusfa.training.learning import loss_state
 from vusfa.training.loggers import flat
 from vusfa.training.metrics import EpisodeMeter, MeanMeter
@@ -97,7 +97,7 @@ class Session:
             yield self._batches(collector)
         finally:
             self._collector = None
-            collector.shutdown()
+            close_collector(collector)
             torch.set_num_threads(threads)
 
     def _batches(self, collector: BaseCollector) -> Iterator[TensorDictBase]:
