@@ -32,6 +32,7 @@ def small(scene_file: Path) -> list[str]:
         f"scenes=[{scene_file}]",
         "env.goals=[3,9,12]",
         "env.max_steps=20",
+        "env.goal_sampling=fixed",
         "agent.hidden_size=8",
         "agent.embedding_size=8",
         "agent.history=2",

@@ -107,13 +107,13 @@ def test_an_unknown_scene(run):
         ),
         ("logger.kinds=[cvs]", "logger.kinds holds 'cvs'"),
         ("objective.gamma=1.5", "objective: USFEstimator: gamma is 1.5"),
-        ("collector.num_envs=3", "leaves some of the 20 goals without an environment"),
+        ("env.goal_sampling=fixed collector.num_envs=3", "leaves some of the 20 goals without an environment"),
         ("agent.memory=gru", "memory is 'gru'"),
         ("device=gpu", "device is 'gpu'"),
     ],
 )
 def test_an_unknown_key_or_value(run, argument: str, words: str):
-    assert words in run(argument)
+    assert words in run(*argument.split())
 
 
 def test_a_damaged_checkpoint(run, tmp_path: Path):
