@@ -17,6 +17,9 @@ __all__ = ["COMMANDS", "main"]
 COMMANDS = [
     "inspect",
     "photos",
+    "thor",
+    "encode",
+    "fetch",
 ]
 
 

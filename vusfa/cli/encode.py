@@ -91,7 +91,6 @@ def encode(
         scene = encode_scene(source, target, network, batch=batch, bfloat16=bfloat16, progress=report)
     said = f"{target}: {scene.num_states} states, {scene.num_crops} crops of {scene.feature_size} features"
     precision = scene.attributes["feature_precision"]
-    refused = bfloat16 and precision != "bfloat16"
     typer.echo(f"{said}; {scene.attributes['feature']}")
-    if refused:
+    if bfloat16 and precision != "bfloat16":
         typer.echo("computed in float32: bfloat16 was not as good for the first batch", err=True)

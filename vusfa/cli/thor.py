@@ -1,0 +1,87 @@
+"""``vusfa scenes export-thor``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+__all__ = ["register"]
+
+
+def register(scenes: typer.Typer) -> None:
+    """Add the command to ``vusfa scenes``."""
+    scenes.command("export-thor")(export_thor)
+
+
+def export_thor(
+    scene: Annotated[str, typer.Argument(help="The simulator's scene: FloorPlan212.", show_default=False)],
+    target: Annotated[Path, typer.Argument(help="File to write.", show_default=False)],
+    grid: Annotated[float, typer.Option(min=0.05, help="Metres between places.")] = 0.5,
+    width: Annotated[int, typer.Option(min=1, help="Width of the pictures in pixels.")] = 400,
+    height: Annotated[int, typer.Option(min=1, help="Height of the pictures.")] = 300,
+    field_of_view: Annotated[float, typer.Option(help="Degrees, top of the picture to bottom.")] = 90,
+    horizon: Annotated[float, typer.Option(help="Degrees that the camera looks down.")] = 0,
+    headless: Annotated[
+        bool, typer.Option("--headless", help="Render without a display (the simulator's CloudRendering).")
+    ] = False,
+    backbone: Annotated[
+        str, typer.Option(help="efficientnet-lite0, torchvision:MODEL, timm:MODEL, a .pt or an .onnx file.")
+    ] = "efficientnet-lite0",
+    weights: Annotated[
+        Path | None, typer.Option(help="State dict of a torchvision or timm model, a file.")
+    ] = None,
+    layer: Annotated[str | None, typer.Option(help="Layer whose output is taken, such as avgpool.")] = None,
+    crops: Annotated[str | None, typer.Option(help="whole (squashed), centre, or ten.")] = None,
+    batch: Annotated[int, typer.Option(min=1, help="Pictures encoded at a time.")] = 32,
+) -> None:
+    """Make a scene from a live AI2-THOR 5 simulator (`pip install 'vusfa[thor]'`).
+
+    Every reachable place is photographed in four headings, and every action is tried from every pose.
+    Stopped, it goes on where it was when the same command is given again. This command is tested with a
+    stand-in for the simulator that answers the same calls: its build cannot be had everywhere.
+
+    Examples:
+
+        vusfa scenes export-thor FloorPlan212 living_room.h5
+
+        vusfa scenes export-thor FloorPlan401 bathroom.h5 --grid 0.25 --headless
+    """
+    from vusfa.cli.resumed import resumed
+    from vusfa.errors import ConfigError
+    from vusfa.scenes.backbones import load_backbone
+    from vusfa.scenes.thor import export
+
+    network = load_backbone(backbone, weights=weights, layer=layer, crops=crops)
+    try:
+        from ai2thor import __version__ as version
+        from ai2thor.controller import Controller
+        from ai2thor.platform import CloudRendering
+    except ModuleNotFoundError as error:
+        raise ConfigError("AI2-THOR is missing: pip install 'vusfa[thor]'") from error
+    settings = {"fieldOfView": field_of_view, "gridSize": grid, "width": width, "height": height}
+    platform = {"platform": CloudRendering} if headless else {}
+    controller = Controller(scene=scene, snapToGrid=True, rotateStepDegrees=90, **settings, **platform)
+    try:
+        with resumed("visiting", "poses") as visited, resumed("encoding", "pictures") as encoded:
+            room = export(
+                controller,
+                target,
+                name=scene,
+                step=grid,
+                horizon=horizon,
+                backbone=network,
+                batch=batch,
+                attributes={"simulator_settings": [f"{key}={value}" for key, value in settings.items()]},
+                versions={"ai2thor": version},
+                visited=visited,
+                encoded=encoded,
+            )
+    finally:
+        controller.stop()
+    left_out, astray = (room.attributes[key] for key in ("places_left_out", "moves_astray"))
+    typer.echo(
+        f"{target}: {room.num_states} states; {left_out} places left out because the agent could not be put"
+        f" there, {astray} moves taken for blocked because they ended at no known pose"
+    )
