@@ -1,0 +1,110 @@
+"""``vusfa scenes render``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from vusfa.errors import ConfigError, SceneError
+
+if TYPE_CHECKING:
+    from vusfa.scenes.render.plan import Plan
+
+__all__ = ["register"]
+
+
+def register(scenes: typer.Typer) -> None:
+    """Add the command to ``vusfa scenes``."""
+    scenes.command("render")(render)
+
+
+def _plan(plan: Path | None, kind: str | None, seed: int, cells: int | None) -> Plan:
+    from vusfa.scenes.render.layout import layout
+    from vusfa.scenes.render.plan_file import load_plan
+
+    if (plan is None) == (kind is None):
+        raise ConfigError("say what to render, either by --plan FILE or by --kind KIND")
+    if plan is not None:
+        if cells is not None:
+            raise ConfigError("--cells belongs to --kind; a plan has its size")
+        return load_plan(plan)
+    assert kind is not None
+    return layout(kind, seed, cells)
+
+
+def render(
+    plan: Annotated[Path | None, typer.Option(help="Plan of the room, a YAML file.")] = None,
+    kind: Annotated[
+        str | None, typer.Option(help="Draw a bathroom, bedroom, kitchen, living_room or hall.")
+    ] = None,
+    seed: Annotated[int, typer.Option(help="What it is drawn from: the same seed, the same room.")] = 1,
+    cells: Annotated[
+        int | None,
+        typer.Option(help="Free places it shall have, of half a metre; by default the kind's own."),
+    ] = None,
+    output: Annotated[
+        Path | None,
+        typer.Option("--output", "-o", help="File to write; by default KIND-SEED or the plan's name."),
+    ] = None,
+    plan_only: Annotated[
+        bool, typer.Option("--plan-only", help="Write the plan, a YAML file to look at and change.")
+    ] = False,
+    backbone: Annotated[
+        str, typer.Option(help="Network that computes the features; see `vusfa scenes encode --help`.")
+    ] = "efficientnet-lite0",
+    weights: Annotated[Path | None, typer.Option(help="Its weights, where they are a file of yours.")] = None,
+    force: Annotated[bool, typer.Option("--force", help="Replace the file if there is one.")] = False,
+) -> None:
+    """Render a room: from its plan, or drawn and furnished from a kind and a seed.
+
+    Needs `pip install 'vusfa[render]'` and furniture: Debian's package sweethome3d-furniture, or a folder of
+    Sweet Home 3D's .sh3f libraries named by SH3D_FURNITURE. With LLVM 16 or later (Debian: libllvm19) it is
+    about four times faster. --plan-only needs none of these.
+
+    Stopped, it goes on where it was when the same command is given again.
+
+    Examples:
+
+        vusfa scenes render --kind bathroom --seed 7
+
+        vusfa scenes render --kind kitchen --seed 2 --cells 120 --plan-only -o kitchen.yaml
+
+        vusfa scenes render --plan kitchen.yaml -o kitchen.h5
+    """
+    from vusfa.scenes.render.grid import poses
+    from vusfa.scenes.render.plan_file import save_plan
+
+    name = plan.stem if plan is not None else f"{kind}-{seed}"
+    target = output or Path(f"{name}.yaml" if plan_only else f"{name}.h5")
+    if target.exists() and not force:
+        raise SceneError(f"{target}: exists; choose another name with -o, or replace it with --force")
+    room = _plan(plan, kind, seed, cells)
+    if plan_only:
+        from vusfa.scenes.render.catalogue import Catalogue
+
+        if not room.is_complete:
+            room = room.completed(Catalogue.open())
+        save_plan(room, target)
+        found = poses(room)
+        typer.echo(
+            f"{target}: {found.num_states} states, {len(found.cells)} places, {len(room.models)} models"
+        )
+        return
+
+    from vusfa.cli.resumed import resumed
+    from vusfa.scenes.backbones import load_backbone
+    from vusfa.scenes.render.room import render_room
+
+    network = load_backbone(backbone, weights=weights)
+    with resumed("rendering", "frames") as frames, resumed("encoding", "pictures") as features:
+        reports = {"frames": frames, "features": features}
+        made = render_room(
+            room,
+            target,
+            lambda what, done, total: reports[what](done, total),
+            backbone=network,
+            say=lambda line: typer.echo(line, err=True),
+        )
+    typer.echo(str(made))

@@ -1,0 +1,251 @@
+"""From a plan to a scene file: frames, features, graph, and whom to thank for the furniture.
+
+The work can be stopped at any moment and started again: finished frames and features lie beside the
+product, in hidden files that are removed when it is written.
+"""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from vusfa.errors import SceneError
+from vusfa.scenes.backbones import DEFAULT, Backbone, load_backbone
+from vusfa.scenes.encode import encode_in_steps
+from vusfa.scenes.faults import raise_faults
+from vusfa.scenes.graph import default_actions, shortest_path_distances
+from vusfa.scenes.provenance import Provenance, this_tool, today
+from vusfa.scenes.render import backend as backends
+from vusfa.scenes.render.catalogue import LICENCES, Catalogue
+from vusfa.scenes.render.faults import plan_faults
+from vusfa.scenes.render.geometry import build_scene
+from vusfa.scenes.render.grid import Poses, poses
+from vusfa.scenes.render.plan import Plan
+from vusfa.scenes.render.plan_file import to_yaml
+from vusfa.scenes.render.renderer import Renderer, exposure_of, tone_map
+from vusfa.scenes.render.textures import random_stream
+from vusfa.scenes.row_log import RowLog
+from vusfa.scenes.store import write
+
+__all__ = ["LOOK_ALIKE", "Rendered", "credits", "look_alike_share", "render_room"]
+
+#: Two states whose features' cosine is at least this look alike.
+LOOK_ALIKE = 0.999
+
+#: ``progress(what, done, total)``: "frames" or "features"; first with what was done before.
+Progress = Callable[[str, int, int], None]
+
+_PROBES = 24
+
+
+@dataclass(frozen=True)
+class Rendered:
+    """What came of rendering a room.
+
+    Args:
+        path: the scene file.
+        states: N.
+        backend: what rendered it.
+        seconds_per_frame: of the frames rendered now; None when all were there from before.
+        look_alikes: share of states that some other state looks like (:func:`look_alike_share`).
+    """
+
+    path: Path
+    states: int
+    backend: str
+    seconds_per_frame: float | None
+    look_alikes: float
+
+    def __str__(self) -> str:
+        rate = f", {self.seconds_per_frame:.2f} s a frame" if self.seconds_per_frame is not None else ""
+        return (
+            f"{self.path}: {self.states} states, {self.backend}{rate}; {100 * self.look_alikes:.1f} % of them"
+            f" look like another state"
+        )
+
+
+def look_alike_share(features: np.ndarray) -> float:
+    """Share of states whose features have a cosine of 0.999 or more with those of another state.
+
+    Args:
+        features: (N, F), or (N, C, F) with all crops side by side.
+
+    >>> look_alike_share(np.array([[1.0, 0.0], [2.0, 0.0], [0.0, 1.0], [0.5, 0.5]]))
+    0.5
+    """
+    flat = features.reshape(len(features), -1).astype(np.float64)
+    flat = flat / np.maximum(np.linalg.norm(flat, axis=1, keepdims=True), 1e-12)
+    alike = 0
+    for first in range(0, len(flat), 1024):
+        cosine = flat[first : first + 1024] @ flat.T
+        rows = np.arange(len(cosine))
+        cosine[rows, first + rows] = -1.0
+        alike += int((cosine.max(axis=1) >= LOOK_ALIKE).sum())
+    return alike / len(flat)
+
+
+def credits(plan: Plan, catalogue: Catalogue) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Licences of the collections that a plan's models are from, and one line of credit for each model."""
+    models = [catalogue[name] for name in plan.models]
+    collections = sorted({model.collection for model in models})
+    licences = tuple(f"{name}: {LICENCES.get(name, 'licence unknown')}" for name in collections)
+    return licences, tuple(model.credit for model in models)
+
+
+class _Frames:
+    """All frames of a room in logs beside the product."""
+
+    def __init__(self, plan: Plan, room: Poses, path: Path, backend: backends.Backend) -> None:
+        self.plan, self.room = plan, room
+        versions = {name: metadata.version(name) for name in ("mitsuba", "mitsuba-oidn")}
+        work = {"plan": to_yaml(plan), "variant": backend.variant, **versions}
+        width, height = plan.camera.resolution
+        shape = (height, width, 3)
+        order = random_stream(plan.surfaces.seed).permutation(room.num_states)
+        self.probed = [int(state) for state in order[:_PROBES]] if plan.camera.exposure is None else []
+        hidden = path.with_name(f".{path.name}.probes"), path.with_name(f".{path.name}.frames")
+        self.probes = RowLog(hidden[0], work, np.dtype((np.float32, shape)))
+        self.frames = RowLog(hidden[1], work, np.dtype((np.uint8, shape)))
+        self.exposure = plan.camera.exposure
+        self.rendered = 0
+
+    def done(self) -> int:
+        """Frames that need no more rendering."""
+        waiting = sum(state >= len(self.frames) for state in self.probed[: len(self.probes)])
+        return len(self.frames) + waiting
+
+    def complete(self) -> bool:
+        return len(self.probes) == len(self.probed) and len(self.frames) == self.room.num_states
+
+    def render(self, renderer: Renderer, tell: Callable[[], None]) -> None:
+        """Render what is not there yet."""
+
+        def linear(state: int) -> np.ndarray:
+            x, z = (float(value) for value in self.room.location[state])
+            self.rendered += 1
+            return renderer.frame(x, z, float(self.room.rotation[state]), state)
+
+        for state in self.probed[len(self.probes) :]:
+            self.probes.append(linear(state)[None])
+            tell()
+        measured = self.probes.read()
+        if self.exposure is None:
+            self.exposure = exposure_of(measured)
+        known = {state: measured[k] for k, state in enumerate(self.probed)}
+        for state in range(len(self.frames), self.room.num_states):
+            frame = known[state] if state in known else linear(state)
+            self.frames.append(tone_map(frame, self.exposure)[None])
+            if state not in known:
+                tell()
+
+    def remove(self) -> None:
+        self.probes.remove()
+        self.frames.remove()
+
+
+def _attributes(
+    plan: Plan, catalogue: Catalogue, backend: backends.Backend, exposure: float
+) -> dict[str, Any]:
+    versions = {name: metadata.version(name) for name in ("mitsuba", "mitsuba-oidn", "trimesh")}
+    licences, thanks = credits(plan, catalogue)
+    origin = Provenance(
+        made_with=this_tool("scenes render", **versions),
+        made_on=today(),
+        plan=to_yaml(plan),
+        seed=plan.seed,
+        licences=licences,
+        credits=thanks,
+    )
+    return {
+        **origin.attributes(),
+        "kind": plan.kind or "room",
+        "models": [f"{name} {catalogue[name].title}" for name in plan.models],
+        "renderer": backend.variant,
+        "exposure": exposure,
+        "cell_m": plan.grid.step,
+        "agent_radius_m": plan.grid.radius,
+        "eye_m": plan.camera.height,
+        "hfov_deg": plan.camera.fov,
+        "spp": plan.camera.samples,
+        "frame": "location=(X right, Z forward); heading 0 = +Z, 90 = +X; RotateRight turns clockwise",
+    }
+
+
+def render_room(
+    plan: Plan,
+    out: str | os.PathLike[str],
+    progress: Progress | None = None,
+    *,
+    catalogue: Catalogue | None = None,
+    backbone: str | Backbone = DEFAULT,
+    backend: backends.Backend | None = None,
+    say: Callable[[str], None] | None = None,
+) -> Rendered:
+    """Render every pose of a plan and write the scene, atomically; called again it goes on where it was.
+
+    The same plan gives the same graph and poses, and with the same variant and versions the same pictures.
+
+    Args:
+        plan: the room.
+        out: scene file to write.
+        progress: told about frames, then features.
+        catalogue: furniture with its files; that of this machine when left out.
+        backbone: makes the features: a name for :func:`vusfa.scenes.backbones.load_backbone`, or a network.
+        backend: Mitsuba's variant; the fastest that works when left out.
+        say: told in a line which variant is used.
+
+    Raises:
+        SceneError: the plan has faults, furniture or packages are missing, or the file cannot be written.
+        ConfigError: the backbone or its weights are missing.
+    """
+    out = Path(out)
+    if not out.parent.is_dir():
+        raise SceneError(f"{out}: there is no folder {out.parent}; make it first")
+    raise_faults(f"plan {plan.name!r}", plan_faults(plan))
+    network = load_backbone(backbone) if isinstance(backbone, str) else backbone
+    catalogue = Catalogue.open() if catalogue is None else catalogue
+    plan = plan.completed(catalogue)
+    raise_faults(f"plan {plan.name!r}", plan_faults(plan))  # sizes from the catalogue may not fit the room
+    room = poses(plan)
+    backend = backends.choose_backend() if backend is None else backend
+    mi = backends.load_mitsuba(backend)
+    (say or (lambda line: None))(f"{plan.name}: {room.num_states} states, rendering with {backend}")
+    report = progress or (lambda what, done, total: None)
+    frames = _Frames(plan, room, out, backend)
+    began = time.monotonic()
+    report("frames", frames.done(), room.num_states)
+    if not frames.complete():
+        renderer = Renderer(mi, build_scene(mi, plan, catalogue), plan.camera)
+        began = time.monotonic()
+        frames.render(renderer, lambda: report("frames", frames.done(), room.num_states))
+    seconds = (time.monotonic() - began) / frames.rendered if frames.rendered else None
+    exposure = frames.exposure or exposure_of(frames.probes.read())
+    features, described, features_log = encode_in_steps(
+        lambda first, last: frames.frames.read(first, last),
+        room.num_states,
+        network,
+        out.with_name(f".{out.name}.features"),
+        {"plan": to_yaml(plan), "renderer": str(backend)},
+        progress=lambda done, total: report("features", done, total),
+    )
+    arrays = {
+        "graph": room.graph,
+        "resnet_feature": features,
+        "location": room.location,
+        "rotation": room.rotation,
+        "shortest_path_distance": shortest_path_distances(room.graph).numpy(),
+    }
+    attributes = {**_attributes(plan, catalogue, backend, exposure), **described}
+    pictures = frames.frames.read()
+    write(out, arrays, name=plan.name, actions=default_actions(4), attributes=attributes, pictures=pictures)
+    frames.remove()
+    features_log.remove()
+    share = look_alike_share(features)
+    return Rendered(out, room.num_states, str(backend), seconds, share)
