@@ -20,6 +20,7 @@ COMMANDS = [
     "thor",
     "encode",
     "fetch",
+    "render",
 ]
 
 
