@@ -64,7 +64,7 @@ class Counter(TensorDictModuleBase):
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         count = tensordict.get("count", torch.zeros(*tensordict.shape, 1, dtype=torch.int64))
-        count = torch.where(tensordict["is_init"], 0, count)
+        assert torch.equal(tensordict["is_init"], count == 0)
         tensordict["action"] = torch.where(count.squeeze(-1) % 3 == 2, 0, 1)
         tensordict["next", "count"] = count + 1
         return tensordict

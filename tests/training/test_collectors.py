@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import signal
 from collections.abc import Callable
 from functools import partial
 
@@ -86,6 +88,7 @@ def test_single(rooms: SceneSet, agent: Agent):
 @pytest.mark.usefixtures("fast_workers")
 def test_workers_in_step(rooms: SceneSet):
     threads = torch.get_num_threads()
+    torch.set_num_threads(3)
     walked = []
     for _ in range(2):
         agent = untrained(rooms)
@@ -102,7 +105,8 @@ def test_workers_in_step(rooms: SceneSet):
         # or the interpreter would hang on its way out
         assert make.collector._weight_sync_schemes["policy"]._instruction_queues == {}
     assert bool((walked[0] == walked[1]).all())
-    assert torch.get_num_threads() == threads
+    assert torch.get_num_threads() == 3
+    torch.set_num_threads(threads)
 
 
 @pytest.mark.usefixtures("fast_workers")
@@ -110,11 +114,13 @@ def test_workers_at_their_own_pace(rooms: SceneSet, agent: Agent):
     def take(batches, count: int) -> list[TensorDictBase]:
         return [next(batches) for _ in range(count)]
 
-    make = partial(open_collector, "multi_async", rooms, agent, num_envs=6)
+    make = Kept("multi_async", rooms, agent, num_envs=6)
     with in_session(rooms, agent, make) as batches:
         first = take(batches, 6)
         assert {batch.shape for batch in first} == {(3, 4)}
         assert all(batch["goal_id"][:, 0].tolist() == [3, 9, 12] for batch in first)
+        for process in make.collector.procs:
+            os.kill(process.pid, signal.SIGINT)  # Ctrl-C reaches them too; it is not theirs to act on
         prefer(agent, 2)
         take(batches, 6)
         assert {int(a) for batch in take(batches, 2) for a in batch["action"].unique()} == {2}
