@@ -17,12 +17,12 @@ import numpy as np
 from vusfa.errors import SceneError
 from vusfa.scenes.faults import raise_faults
 
-__all__ = ["GridPoses", "fit_offset", "fit_step", "fit_turn", "put_on_grid"]
+__all__ = ["GridPoses", "fit_lattice", "fit_offset", "fit_step", "fit_turn", "put_on_grid"]
 
 _TURNS = (360, 180, 90, 45)
 _OFF_PLACE = 0.25  # of a step
 _OFF_HEADING = 10.0  # degrees
-_ALIGNED = 2.0  # degrees: a frame so little turned counts as not turned
+_ALIGNED = 2.0  # degrees: headings so little turned count as not turned
 _MOST = 0.9  # share of the poses that a turn must explain
 
 
@@ -81,13 +81,13 @@ def fit_turn(rotation: np.ndarray) -> int:
 
 
 def fit_step(location: np.ndarray, heading: np.ndarray) -> float:
-    """The step of the grid that most places are near.
+    """Roughly the step of the grid that most places are near.
 
-    Poses of one heading have different places, so that their nearest neighbours are one step away; the median
-    of these distances is then made more exact by longer and longer ones.
+    Poses of one heading have different places, so that their nearest neighbours are one step away: the median
+    of these distances.
 
     Args:
-        location: (N, 2) along the grid's axes.
+        location: (N, 2).
         heading: (N,) integers, the number of each pose's heading.
 
     Returns:
@@ -103,28 +103,61 @@ def fit_step(location: np.ndarray, heading: np.ndarray) -> float:
             np.fill_diagonal(apart, np.inf)
             nearest.append(apart.min(1))
     step = float(np.median(np.concatenate(nearest))) if len(nearest) > 1 else 1.0
-    if not step > 0:
-        return 1.0
-    for reach in (1, 4, 16, 64):
-        step = _refined(location, step, reach)
-    # A round number, where that moves no grid point noticeably.
-    size = float(np.ptp(location, axis=0).max()) / step
-    rounded = round(step, 2)
-    return rounded if rounded > 0 and abs(rounded - step) * size < 0.1 * step else step
+    return step if step > 0 else 1.0
 
 
-def _refined(location: np.ndarray, step: float, reach: int) -> float:
-    """Least squares over coordinates that are up to ``reach`` steps apart."""
-    above = below = 0.0
-    for values in location.T:
-        distinct = np.unique(np.round(values, 4))
-        distinct = distinct[:: -(-len(distinct) // 1000)]
-        apart = (distinct[:, None] - distinct[None]).ravel()
-        steps = np.rint(apart / step)
-        used = (steps > 0) & (steps <= reach) & (np.abs(apart / step - steps) < _OFF_PLACE)
-        above += float((apart[used] * steps[used]).sum())
-        below += float((steps[used] ** 2).sum())
-    return above / below if below else step
+def fit_lattice(place: np.ndarray, basis: complex, fixed_step: bool = False) -> tuple[complex, complex]:
+    """The square lattice that most places are near: ``origin + basis * (a + b i)`` for integers a and b.
+
+    It is fitted to the places near the middle first, then, by least squares, to more and more of them: a
+    small error of the step or of the angle adds up over a long way, and must be mended before it amounts to a
+    cell.
+
+    Args:
+        place: (N,) complex, x + z i.
+        basis: a rough one; its length is the step, its angle that of the lattice.
+        fixed_step: whether the length is exact.
+
+    Returns:
+        origin and basis.
+    """
+    middle = place[np.abs(place - place.mean()).argmin()]
+    away = np.abs(place - middle)
+    reach = 3.0
+    near = away <= reach * abs(basis)
+    along = (place[near] - middle) / basis
+    origin = middle + basis * complex(fit_offset(along.real, 1.0), fit_offset(along.imag, 1.0))
+    while True:
+        near = away <= reach * abs(basis)
+        along = (place - origin) / basis
+        cell = np.rint(along.real) + 1j * np.rint(along.imag)
+        used = near & (np.abs(along - cell) <= _OFF_PLACE)
+        if len(np.unique(cell[used])) > 1:
+            centred = cell[used] - cell[used].mean()
+            slope = (np.conj(centred) * place[used]).sum() / (np.abs(centred) ** 2).sum()
+            basis = complex(slope / abs(slope) * abs(basis) if fixed_step else slope)
+        if used.any():
+            origin = complex((place[used] - basis * cell[used]).mean())
+        if near.all():
+            return origin, basis
+        reach *= 1.5
+
+
+def _rounded(origin: complex, basis: complex, place: np.ndarray, fixed_step: bool) -> tuple[complex, complex]:
+    """Step and angle as round numbers, where that moves no grid point noticeably."""
+    step, angle = abs(basis), math.degrees(np.angle(basis))
+    size = float(np.abs(place - origin).max()) / step
+    round_step, round_angle = step if fixed_step else round(step, 2), float(round(angle))
+    if round_step > 0 and abs(round_step - step) * size < 0.02 * step:
+        step = round_step
+    if abs(math.radians(round_angle - angle)) * size < 0.02:
+        angle = round_angle
+    # numpy's own sine and cosine are not exact at 90 degrees
+    quarter = {0.0: 1.0, 90.0: 1j, -90.0: -1j, 180.0: -1.0}
+    basis = step * complex(quarter.get(angle, complex(np.exp(1j * math.radians(angle)))))
+    along = (place - origin) / basis
+    shift = complex(fit_offset(along.real, 1.0), fit_offset(along.imag, 1.0))
+    return complex(np.round(origin + basis * shift, 4)), basis
 
 
 def put_on_grid(
@@ -168,14 +201,19 @@ def put_on_grid(
     heading = np.rint((rotation - first) / turn).astype(np.int64) % (360 // turn)
     off_heading = _beyond(rotation - first, turn)
 
-    # The grid's axes lie along the headings.
-    cos, sin = math.cos(math.radians(first)), math.sin(math.radians(first))
-    along = location @ np.array([[cos, sin], [-sin, cos]])
-    step = fit_step(along, heading) if step is None else step
-    origin = np.array([fit_offset(values, step) for values in along.T]).round(4)
-    cell = np.rint((along - origin) / step).astype(np.int64)
-    snapped = (origin + cell * step) @ np.array([[cos, -sin], [sin, cos]])
-    off_place = np.linalg.norm(snapped - location, axis=1)
+    # The grid's axes lie along the headings. With x + z i for a place, to turn clockwise by an angle is to
+    # multiply by exp(-i angle); the lattice's own coordinates are then right + ahead i.
+    place = location @ np.array([1, 1j])
+    rough = fit_step(location, heading) if step is None else step
+    basis = rough * complex(np.exp(-1j * math.radians(first)))
+    origin, basis = fit_lattice(place, basis, fixed_step=step is not None)
+    origin, basis = _rounded(origin, basis, place, fixed_step=step is not None)
+    step = abs(basis)
+    along = (place - origin) / basis
+    cell = np.stack([np.rint(along.real), np.rint(along.imag)], 1).astype(np.int64)
+    on_grid = origin + basis * (cell @ np.array([1, 1j]))
+    snapped = np.stack([on_grid.real, on_grid.imag], 1)
+    off_place = np.abs(on_grid - place)
 
     faults: list[str] = []
     states: dict[tuple[int, int, int], int] = {}
