@@ -85,3 +85,22 @@ def fast_workers() -> Iterator[None]:
     torch.multiprocessing.set_start_method("forkserver", force=True)
     yield
     torch.multiprocessing.set_start_method(before, force=True)
+
+
+@pytest.fixture
+def wandb_content() -> Callable[[Path], bytes]:
+    """What a .wandb file holds, joined where its 32 KB blocks cut it."""
+
+    def read(path: Path) -> bytes:
+        data, place, parts = path.read_bytes(), 7, []  # behind the file's head
+        while place + 7 <= len(data):
+            left = 32768 - place % 32768
+            if left < 7:  # padding: a record's head is not cut
+                place += left
+                continue
+            length = int.from_bytes(data[place + 4 : place + 6], "little")  # behind a checksum
+            parts.append(data[place + 7 : place + 7 + length])
+            place += 7 + length
+        return b"".join(parts)
+
+    return read

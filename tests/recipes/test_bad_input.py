@@ -107,7 +107,10 @@ def test_an_unknown_scene(run):
         ),
         ("logger.kinds=[cvs]", "logger.kinds holds 'cvs'"),
         ("objective.gamma=1.5", "objective: USFEstimator: gamma is 1.5"),
-        ("env.goal_sampling=fixed collector.num_envs=3", "leaves some of the 20 goals without an environment"),
+        (
+            "env.goal_sampling=fixed collector.num_envs=3",
+            "leaves some of the 20 goals without an environment",
+        ),
         ("agent.memory=gru", "memory is 'gru'"),
         ("device=gpu", "device is 'gpu'"),
     ],

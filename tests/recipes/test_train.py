@@ -65,6 +65,8 @@ def test_a_run_learns_and_tells(recipe, settings, small, tmp_path: Path, capsys:
         "agent.model=gvf",
         "agent.hidden_size=32",
         "agent.embedding_size=32",
+        "collector.num_envs=12",
+        "collector.rollout=10",
         "total_frames=24000",
         "log_every=2400",
         "optim.lr=0.003",
@@ -120,7 +122,9 @@ def test_options_train(recipe, settings, small, tmp_path: Path, options: list[st
 
 
 @pytest.mark.filterwarnings("default")  # TensorBoard and wandb themselves
-def test_all_loggers_hear_of_a_run(recipe, settings, small, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_all_loggers_hear_of_a_run(
+    recipe, settings, small, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, wandb_content
+):
     monkeypatch.setenv("WANDB_DATA_DIR", str(tmp_path / "data"))
     options = [
         "logger.kinds=[csv,tensorboard,wandb]",
@@ -132,7 +136,7 @@ def test_all_loggers_hear_of_a_run(recipe, settings, small, tmp_path: Path, monk
     ]
     session, _, _ = recipe("train").train(settings(*small, *options), options)
     (stored,) = (tmp_path / "run" / "wandb").glob(f"offline-run-*/run-{session.run_id}.wandb")
-    content = stored.read_bytes()
+    content = wandb_content(stored)
     for word in (
         b"goal/hall/3/success",
         b"scene/hall/length_ratio",

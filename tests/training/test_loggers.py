@@ -89,7 +89,7 @@ def test_tensorboard(tmp_path: Path):
 
 
 @pytest.mark.filterwarnings("default")  # wandb's own
-def test_wandb_offline(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_wandb_offline(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, wandb_content):
     monkeypatch.setenv("HOME", str(tmp_path / "home"))
     monkeypatch.delenv("WANDB_DATA_DIR", raising=False)
     checkpoint = tmp_path / "checkpoint.pt"
@@ -112,7 +112,7 @@ def test_wandb_offline(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     deadline = time.monotonic() + 60.0
     while not all(word in stored.read_bytes() for word in words) and time.monotonic() < deadline:
         time.sleep(0.2)
-    content = stored.read_bytes()
+    content = wandb_content(stored)
     assert [word for word in words if word not in content] == []
     monkeypatch.delenv("WANDB_DATA_DIR", raising=False)
     os.environ.pop("WANDB_DATA_DIR", None)
