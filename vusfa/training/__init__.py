@@ -15,6 +15,7 @@ from vusfa.training.session import (
     make_observation,
     rebuild_agent,
     scene_sources,
+    set_threads,
     torch_device,
 )
 from vusfa.training.signals import StopOnSignal
@@ -39,6 +40,7 @@ __all__ = [
     "rebuild_agent",
     "save_checkpoint",
     "scene_sources",
+    "set_threads",
     "torch_device",
     "total_loss",
 ]

@@ -185,7 +185,7 @@ def _report(job: Callable[[], int], folder: Path, name: str) -> int:
     except (HydraException, OmegaConfBaseException) as error:
         return _complain(explain(error, folder, name))
     except KeyboardInterrupt:
-        return _complain("interrupted before the first update; nothing was written", INTERRUPTED)
+        return _complain("interrupted; a checkpoint written before this is whole", INTERRUPTED)
 
 
 def _complain(message: str, code: int = BAD_INPUT) -> int:

@@ -32,7 +32,15 @@ from vusfa.training.learning import loss_state
 from vusfa.training.loggers import flat
 from vusfa.training.metrics import EpisodeMeter, MeanMeter
 
-__all__ = ["Session", "load_agent", "make_observation", "rebuild_agent", "scene_sources", "torch_device"]
+__all__ = [
+    "Session",
+    "load_agent",
+    "make_observation",
+    "rebuild_agent",
+    "scene_sources",
+    "set_threads",
+    "torch_device",
+]
 
 # entries of Agent.config that describe the scenes, not the agent
 _OF_SCENES = ("scenes", "fingerprint", "num_actions")
@@ -231,6 +239,23 @@ def make_observation(agent: Agent, scenes: SceneSet, crop: str = "first") -> Sce
     if kind == "features":
         return SceneObservation(scenes, "features", crop=crop)
     return SceneObservation(scenes, "pixels", size=tuple(agent.config["picture_size"]))
+
+
+def set_threads(threads: int) -> None:
+    """Sets how many processor threads torch computes with in this process.
+
+    Raises:
+        ConfigError: fewer than one.
+
+    >>> before = torch.get_num_threads()
+    >>> set_threads(1)
+    >>> torch.get_num_threads()
+    1
+    >>> set_threads(before)
+    """
+    if threads < 1:
+        raise ConfigError(f"threads is {threads}; give 1 or more")
+    torch.set_num_threads(threads)
 
 
 def torch_device(name: str) -> torch.device:
