@@ -31,13 +31,20 @@ __all__ = ["bfloat16_is_as_good", "encode_in_steps", "encode_pictures", "encode_
 #: ``progress(done, total)``: first with what was done before, then after every step
 Progress = Callable[[int, int], None]
 
+_AT_ONCE = 8  # images
 _AS_GOOD = 0.999  # lowest cosine of bfloat16's features with float32's
 
 
 def _crops(pictures: np.ndarray, backbone: Backbone, bfloat16: bool) -> np.ndarray:
     """Features (n, C, F) of some pictures, all at once."""
-    found = backbone(prepare(pictures, backbone.preprocessing), bfloat16)
-    return found.reshape(len(pictures), backbone.preprocessing.num_crops, -1).numpy()
+    num_crops = backbone.preprocessing.num_crops
+    # On a processor few images at a time are 2 to 3 times faster: their maps fit the memory that is at hand.
+    at_once = max(1, _AT_ONCE // num_crops) if backbone.device == "cpu" else len(pictures)
+    found = [
+        backbone(prepare(pictures[first : first + at_once], backbone.preprocessing), bfloat16)
+        for first in range(0, len(pictures), at_once)
+    ]
+    return torch.cat(found).reshape(len(pictures), num_crops, -1).numpy()
 
 
 def _checked(pictures: Any) -> np.ndarray:
