@@ -34,6 +34,7 @@ from vusfa.training import (
     make_observation,
     make_optimiser,
     scene_sources,
+    set_threads,
     torch_device,
     total_loss,
 )
@@ -51,6 +52,7 @@ def train(cfg: DictConfig, overrides: list[str]) -> tuple[Session, Comparison | 
         the session, its evaluation, if there was any, and the exit code: 0, or 130 or 143 when a signal ended
         it.
     """
+    set_threads(cfg.threads)
     torch.manual_seed(cfg.seed)
     device, checkpoint = torch_device(cfg.device), Path(cfg.folder) / "checkpoint.pt"
     plain: dict[str, Any] = OmegaConf.to_container(cfg, resolve=True)  # type: ignore[assignment]

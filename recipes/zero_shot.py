@@ -18,7 +18,7 @@ from rich.progress import Progress
 
 from vusfa.errors import VusfaError
 from vusfa.evaluation import compare, print_summary
-from vusfa.training import load_agent, make_observation, rebuild_agent
+from vusfa.training import load_agent, make_observation, rebuild_agent, set_threads
 
 
 def zero_shot(
@@ -32,6 +32,7 @@ def zero_shot(
     unreachable: Literal["skip", "fail"] = "skip",
     seed: int = 0,
     device: str = "cpu",
+    threads: int = 1,
     out: Path | None = None,
 ) -> None:
     """Evaluate a checkpoint of recipes/train.py.
@@ -46,8 +47,10 @@ def zero_shot(
             failures.
         seed: of starts, actions and the untrained network.
         device: where to compute.
+        threads: processor threads; more than 1 pays on an idle machine only.
         out: where to write, without suffix; zero_shot beside the checkpoint when not given.
     """
+    set_threads(threads)
     agent, scenes, state = load_agent(checkpoint, device=device)
     torch.manual_seed(seed)
     untrained = rebuild_agent(agent.config, scenes).to(device)

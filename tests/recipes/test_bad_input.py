@@ -113,6 +113,7 @@ def test_an_unknown_scene(run):
         ),
         ("agent.memory=gru", "memory is 'gru'"),
         ("device=gpu", "device is 'gpu'"),
+        ("threads=0", "threads is 0; give 1 or more"),
     ],
 )
 def test_an_unknown_key_or_value(run, argument: str, words: str):
