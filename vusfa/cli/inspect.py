@@ -169,7 +169,8 @@ def _print_wide(table: Table) -> None:
 def show(
     scene: Annotated[str, typer.Argument(help="Bundled name or scene file.", show_default=False)],
     output: Annotated[
-        Path | None, typer.Option("--output", "-o", help="The PNG; by default the scene's name with .png.")
+        Path | None,
+        typer.Option("--output", "-o", help="The PNG; by default SCENE.png, here."),
     ] = None,
     pictures: Annotated[int, typer.Option(min=1, max=100, help="How many pictures to show.")] = 12,
 ) -> None:
@@ -190,7 +191,7 @@ def show(
     (loaded,) = SceneSet.open(scene).scenes
     for line in _description(loaded, summarise(loaded)):
         typer.echo(line)
-    typer.echo(f"drawn: {save_sheet(loaded, output or Path(f'{loaded.name}.png'), pictures)}")
+    typer.echo(f"drawn: {save_sheet(loaded, output or Path(Path(scene).stem + '.png'), pictures)}")
 
 
 def _description(scene: Scene, summary: Summary) -> list[str]:
