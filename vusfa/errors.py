@@ -1,7 +1,8 @@
 """The errors that a user can cause and mend.
 
 Each message names the culprit (a file, a field, a state, a key of a configuration) and says what to do about
-it. They derive from :class:`ValueError`, so that code which knows nothing of this package can still catch them.
+it. They derive from :class:`ValueError`, so that code which knows nothing of this package can still catch
+them.
 """
 
 from __future__ import annotations

@@ -273,7 +273,7 @@ def test_the_short_cut_is_what_torchrl_does(
         assert (taken == taken_theirs).all()
         # Of what a policy wrote the base class makes zeros in some rows that are reset; here it stays.
         assert (mine["from_the_policy"] == count).all()
-        known = [key for key in mine.keys() if key not in ("action", "from_the_policy")]  # noqa: SIM118
+        known = [key for key in mine.keys() if key not in ("action", "from_the_policy")]
         assert (mine.select(*known) == other.select(*known)).all()
         ended += int(taken["next", "done"].sum())
     assert ended > 0

@@ -116,7 +116,7 @@ def check(data: Any, agents: list[Agent]) -> None:
     assert len(agents) == len(flat)
     for key in agents[0].told():
         assert flat[key].tolist() == [agent.told()[key] for agent in agents], key
-    if "reward" in flat.keys():  # noqa: SIM118
+    if "reward" in flat.keys():
         torch.testing.assert_close(flat["reward"][:, 0], torch.tensor([agent.reward for agent in agents]))
 
 
