@@ -21,6 +21,7 @@ from vusfa.evaluation import Comparison, compare, print_summary
 from vusfa.modules import make_agent
 from vusfa.scenes import SceneSet
 from vusfa.training import (
+    EvaluationProgress,
     ProgressLine,
     Session,
     StopOnSignal,
@@ -121,7 +122,9 @@ def train(cfg: DictConfig, overrides: list[str]) -> tuple[Session, Comparison | 
             options = {**plain["evaluation"], "history": history, "observe": observation}
             wanted = options.pop("goals")
             wanted = goals if wanted == "trained" else wanted
-            result = compare({agent.config["model"]: actor}, scenes, wanted, trained=goals, **options)
+            with EvaluationProgress() as told:
+                policies = {agent.config["model"]: actor}
+                result = compare(policies, scenes, wanted, trained=goals, progress=told, **options)
             result.save(checkpoint.with_name("evaluation"))
             loggers.log_table("evaluation", result.rows, session.frames)
             print_summary(result.rows, note=result.note)

@@ -14,11 +14,10 @@ from typing import Literal
 
 import torch
 import tyro
-from rich.progress import Progress
 
 from vusfa.errors import VusfaError
 from vusfa.evaluation import compare, print_summary
-from vusfa.training import load_agent, make_observation, rebuild_agent, set_threads
+from vusfa.training import EvaluationProgress, load_agent, make_observation, rebuild_agent, set_threads
 
 
 def zero_shot(
@@ -55,14 +54,13 @@ def zero_shot(
     torch.manual_seed(seed)
     untrained = rebuild_agent(agent.config, scenes).to(device)
     policies = {agent.config["model"]: agent, "untrained": untrained}
-    with Progress(transient=True) as bar:
-        tasks = {name: bar.add_task(name, total=None) for name in policies}
+    with EvaluationProgress() as progress:
         result = compare(
             {name: policy.get_policy_operator() for name, policy in policies.items()},
             scenes,
             goals,
             trained=state["goals"],
-            progress=lambda name, done, total: bar.update(tasks[name], completed=done, total=total),
+            progress=progress,
             episodes_per_goal=episodes,
             max_steps=max_steps,
             history=agent.config["history"],

@@ -7,7 +7,7 @@ import math
 
 from rich.console import Console
 
-from vusfa.training import ProgressLine
+from vusfa.training import EvaluationProgress, ProgressLine
 from vusfa.training.progress import describe
 
 
@@ -63,3 +63,15 @@ def test_the_rate_is_that_of_the_last_half_minute():
         frames += 1000 if second < 50 else 10
         line.update(frames)
     assert " 10 a second" in page.getvalue().splitlines()[-1]
+
+
+def test_an_evaluation_has_a_line_for_each_policy():
+    page = io.StringIO()
+    with EvaluationProgress(Console(file=page, width=200), every=0.0) as progress:
+        progress("vusfa", 1, 4)
+        progress("vusfa", 4, 4)
+        progress("untrained", 2, 4)
+    lines = page.getvalue().splitlines()
+    assert lines[0] == "1 of 4 episodes of vusfa"
+    assert any(line.startswith("4 of 4 episodes of vusfa |") for line in lines)
+    assert lines[-1].startswith("2 of 4 episodes of untrained")

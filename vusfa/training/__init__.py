@@ -8,7 +8,7 @@ from vusfa.training.collectors import check_goals_dealt, make_collector, make_en
 from vusfa.training.learning import annealed, descend, make_loss, make_optimiser, total_loss
 from vusfa.training.loggers import make_loggers
 from vusfa.training.metrics import EpisodeMeter, MeanMeter
-from vusfa.training.progress import ProgressLine
+from vusfa.training.progress import EvaluationProgress, ProgressLine
 from vusfa.training.session import (
     Session,
     load_agent,
@@ -22,6 +22,7 @@ from vusfa.training.signals import StopOnSignal
 
 __all__ = [
     "EpisodeMeter",
+    "EvaluationProgress",
     "MeanMeter",
     "ProgressLine",
     "Session",

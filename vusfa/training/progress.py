@@ -1,4 +1,4 @@
-"""The live line of a training: frames, rate, success, length over shortest path, time to go."""
+"""The live line of a training or an evaluation: how far, how fast, how well, how long to go."""
 
 from __future__ import annotations
 
@@ -13,17 +13,18 @@ if TYPE_CHECKING:
     from rich.console import Console
     from rich.live import Live
 
-__all__ = ["ProgressLine", "describe"]
+__all__ = ["EvaluationProgress", "ProgressLine", "describe"]
 
 
 class ProgressLine:
     """One line that renews itself on a terminal; elsewhere (a file, a pipe) a new line now and then.
 
     Args:
-        total: frames at which the training ends.
+        total: frames at which the training ends, or whatever else is counted.
         console: where to write; standard error by default, so that results can be piped.
         every: seconds between lines when the output is not a terminal.
         clock: gives the time in seconds.
+        unit: what is counted.
     """
 
     def __init__(
@@ -32,12 +33,14 @@ class ProgressLine:
         console: Console | None = None,
         every: float = 10.0,
         clock: Callable[[], float] = time.monotonic,
+        unit: str = "frames",
     ) -> None:
         from rich.console import Console
         from rich.live import Live
         from rich.text import Text
 
         self._total = total
+        self._unit = unit
         self._console = console or Console(stderr=True)
         self._every = every
         self._clock = clock
@@ -58,14 +61,14 @@ class ProgressLine:
         self._ratio = self._ratio if math.isnan(length_ratio) else length_ratio
 
     def update(self, frames: int) -> None:
-        """So many frames have been trained on."""
+        """So many are done."""
         now = self._clock()
         if self._recent and now - self._recent[0][0] > 30.0:
             self._recent.popleft()
         self._recent.append((now, frames))
         (then, before) = self._recent[0]
         speed = (frames - before) / (now - then) if now > then else math.nan
-        self._line = describe(frames, self._total, speed, self._success, self._ratio)
+        self._line = describe(frames, self._total, speed, self._success, self._ratio, self._unit)
         if self._live is None and now - self._printed >= self._every:
             self._print(now)
 
@@ -89,13 +92,49 @@ class ProgressLine:
         self._console.print(self._line, soft_wrap=True, highlight=False)
 
 
-def describe(frames: int, total: int, speed: float, success: float, length_ratio: float) -> str:
+class EvaluationProgress:
+    """A :class:`ProgressLine` for each policy in turn that :func:`vusfa.evaluation.compare` evaluates.
+
+    >>> with EvaluationProgress() as progress:
+    ...     result = None  # compare(policies, scenes, "all", progress=progress)
+    """
+
+    def __init__(self, console: Console | None = None, every: float = 10.0) -> None:
+        self._console = console
+        self._every = every
+        self._policy: str | None = None
+        self._line: ProgressLine | None = None
+
+    def __call__(self, policy: str, done: int, total: int) -> None:
+        """So many of a policy's episodes are done."""
+        if policy != self._policy or self._line is None:
+            self._close()
+            self._policy = policy
+            self._line = ProgressLine(total, self._console, self._every, unit=f"episodes of {policy}")
+        self._line.update(done)
+
+    def __enter__(self) -> EvaluationProgress:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._close()
+
+    def _close(self) -> None:
+        if self._line is not None:
+            self._line.close()
+
+
+def describe(
+    frames: int, total: int, speed: float, success: float, length_ratio: float, unit: str = "frames"
+) -> str:
     """The line itself; NaN for what is not known yet.
 
     >>> describe(250_000, 1_000_000, 5000.0, 0.975, 1.127)
     '250,000 of 1,000,000 frames | 5,000 a second | success 97.5 % | length / shortest 1.13 | 2:30 to go'
     """
-    parts = [f"{frames:,} of {total:,} frames"]
+    parts = [f"{frames:,} of {total:,} {unit}"]
     if not math.isnan(speed):
         parts.append(f"{speed:,.0f} a second")
     if not math.isnan(success):
