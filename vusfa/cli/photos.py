@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import io
-from enum import Enum
+from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 __all__ = ["register"]
 
 
-class Store(str, Enum):
+class Store(StrEnum):
     """How a scene file keeps its pictures."""
 
     JPEG = "jpeg"
