@@ -61,7 +61,7 @@ def render(
 
     Needs `pip install 'vusfa[render]'` and furniture: Debian's package sweethome3d-furniture, or a folder of
     Sweet Home 3D's .sh3f libraries named by SH3D_FURNITURE. With LLVM 16 or later (Debian: libllvm19) it is
-    about four times faster. --plan-only needs none of these.
+    about ten times faster. --plan-only needs none of these.
 
     Stopped, it goes on where it was when the same command is given again.
 

@@ -189,7 +189,7 @@ KINDS: dict[str, Programme] = {
         tops=_pool("C22 C124 B109 B98 S57 S41 B125 B92"),
     ),
     "hall": Programme(
-        cells=56,
+        cells=54,
         grid=(13, 7),
         notch=(4, 2),
         partition=0.0,

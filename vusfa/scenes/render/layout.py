@@ -27,7 +27,7 @@ __all__ = ["best_lamps", "layout", "room_seed", "scaled"]
 #: Metres from a wall to the first places of the grid.
 MARGIN = 0.3
 _GRID = Grid()
-_ATTEMPTS = 600
+_ATTEMPTS, _TRIALS = 600, 8
 _GOOD_ENOUGH = 1.5
 _FEWEST_CELLS = 12
 
@@ -41,8 +41,13 @@ def room_seed(kind: str, seed: int) -> int:
     return sum(map(ord, kind)) * 1000 + seed
 
 
-def scaled(kind: str, cells: int | None) -> tuple[Programme, float]:
+def scaled(kind: str, cells: int | None, roomier: float = 1.0) -> tuple[Programme, float]:
     """A kind's programme for some number of free places, and the share of furniture that belongs to it.
+
+    Args:
+        kind: of room.
+        cells: free places; the kind's own when None.
+        roomier: a factor on the floor, for the same furniture.
 
     Raises:
         SceneError: there is no such kind, or ``cells`` is too small.
@@ -56,9 +61,9 @@ def scaled(kind: str, cells: int | None) -> tuple[Programme, float]:
     if cells < _FEWEST_CELLS:
         raise SceneError(f"cells: {cells} is too few for a room; ask for {_FEWEST_CELLS} or more")
     share = cells / base.cells
-    side = math.sqrt(share)
+    side = math.sqrt(share * roomier)
     columns = max(3, round(base.grid[0] * side))
-    rows = max(3, round(base.grid[1] * base.grid[0] * share / columns))
+    rows = max(3, round(base.grid[1] * base.grid[0] * share * roomier / columns))
     notch = (round(base.notch[0] * side), round(base.notch[1] * side))
     changed = {
         "cells": cells,
@@ -99,6 +104,7 @@ class _Attempt:
     cost: float
     draft: Draft
     cells: list[tuple[int, int]]
+    cut_off: int
 
 
 def _attempt(
@@ -113,7 +119,7 @@ def _attempt(
     standing = sum(item.role == "floor" for item in draft.items)
     cost = abs(len(cells) - kind.cells) + 0.5 * cut_off
     cost += 3 * max(0, standing - round(20 * share)) + 3 * max(0, round(8 * share) - standing)
-    return _Attempt(cost, draft, cells)
+    return _Attempt(cost, draft, cells, cut_off)
 
 
 def best_lamps(places: np.ndarray, solids: list[Rect]) -> list[int]:
@@ -192,12 +198,19 @@ def layout(kind: str, seed: int = 1, cells: int | None = None, catalogue: Catalo
     """
     catalogue = Catalogue.bundled() if catalogue is None else catalogue
     kind_programme, share = scaled(kind, cells)
+    if cells is not None and kind_programme is not programme(kind):
+        # The same furniture takes about the same floor in a larger room: a few drafts tell how much.
+        tried = [_attempt(kind_programme, share, kind, seed, -k, catalogue) for k in range(1, _TRIALS + 1)]
+        free = sum(len(draft.cells) + draft.cut_off for draft in tried) / _TRIALS
+        places = kind_programme.grid[0] * kind_programme.grid[1]
+        kind_programme, share = scaled(kind, cells, (cells + places - free) / places)
     best: _Attempt | None = None
     for number in range(_ATTEMPTS):
         found = _attempt(kind_programme, share, kind, seed, number, catalogue)
         if best is None or found.cost < best.cost:
             best = found
-        if best.cost <= _GOOD_ENOUGH:
+        # A large room need not be met as exactly as a small one.
+        if best.cost <= max(_GOOD_ENOUGH, 0.02 * kind_programme.cells * (share != 1.0)):
             break
     assert best is not None
     if not best.cells:

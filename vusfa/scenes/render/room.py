@@ -25,13 +25,12 @@ from vusfa.scenes.provenance import Provenance, this_tool, today
 from vusfa.scenes.render import backend as backends
 from vusfa.scenes.render.catalogue import LICENCES, Catalogue
 from vusfa.scenes.render.faults import plan_faults
+from vusfa.scenes.render.frames import Frames
 from vusfa.scenes.render.geometry import build_scene
-from vusfa.scenes.render.grid import Poses, poses
+from vusfa.scenes.render.grid import poses
 from vusfa.scenes.render.plan import Plan
 from vusfa.scenes.render.plan_file import to_yaml
-from vusfa.scenes.render.renderer import Renderer, exposure_of, tone_map
-from vusfa.scenes.render.textures import random_stream
-from vusfa.scenes.row_log import RowLog
+from vusfa.scenes.render.renderer import Renderer
 from vusfa.scenes.store import write
 
 __all__ = ["LOOK_ALIKE", "Rendered", "credits", "look_alike_share", "render_room"]
@@ -41,8 +40,6 @@ LOOK_ALIKE = 0.999
 
 #: ``progress(what, done, total)``: "frames" or "features"; first with what was done before.
 Progress = Callable[[str, int, int], None]
-
-_PROBES = 24
 
 
 @dataclass(frozen=True)
@@ -97,57 +94,6 @@ def credits(plan: Plan, catalogue: Catalogue) -> tuple[tuple[str, ...], tuple[st
     collections = sorted({model.collection for model in models})
     licences = tuple(f"{name}: {LICENCES.get(name, 'licence unknown')}" for name in collections)
     return licences, tuple(model.credit for model in models)
-
-
-class _Frames:
-    """All frames of a room in logs beside the product."""
-
-    def __init__(self, plan: Plan, room: Poses, path: Path, backend: backends.Backend) -> None:
-        self.plan, self.room = plan, room
-        versions = {name: metadata.version(name) for name in ("mitsuba", "mitsuba-oidn")}
-        work = {"plan": to_yaml(plan), "variant": backend.variant, **versions}
-        width, height = plan.camera.resolution
-        shape = (height, width, 3)
-        order = random_stream(plan.surfaces.seed).permutation(room.num_states)
-        self.probed = [int(state) for state in order[:_PROBES]] if plan.camera.exposure is None else []
-        hidden = path.with_name(f".{path.name}.probes"), path.with_name(f".{path.name}.frames")
-        self.probes = RowLog(hidden[0], work, np.dtype((np.float32, shape)))
-        self.frames = RowLog(hidden[1], work, np.dtype((np.uint8, shape)))
-        self.exposure = plan.camera.exposure
-        self.rendered = 0
-
-    def done(self) -> int:
-        """Frames that need no more rendering."""
-        waiting = sum(state >= len(self.frames) for state in self.probed[: len(self.probes)])
-        return len(self.frames) + waiting
-
-    def complete(self) -> bool:
-        return len(self.probes) == len(self.probed) and len(self.frames) == self.room.num_states
-
-    def render(self, renderer: Renderer, tell: Callable[[], None]) -> None:
-        """Render what is not there yet."""
-
-        def linear(state: int) -> np.ndarray:
-            x, z = (float(value) for value in self.room.location[state])
-            self.rendered += 1
-            return renderer.frame(x, z, float(self.room.rotation[state]), state)
-
-        for state in self.probed[len(self.probes) :]:
-            self.probes.append(linear(state)[None])
-            tell()
-        measured = self.probes.read()
-        if self.exposure is None:
-            self.exposure = exposure_of(measured)
-        known = {state: measured[k] for k, state in enumerate(self.probed)}
-        for state in range(len(self.frames), self.room.num_states):
-            frame = known[state] if state in known else linear(state)
-            self.frames.append(tone_map(frame, self.exposure)[None])
-            if state not in known:
-                tell()
-
-    def remove(self) -> None:
-        self.probes.remove()
-        self.frames.remove()
 
 
 def _attributes(
@@ -218,17 +164,17 @@ def render_room(
     mi = backends.load_mitsuba(backend)
     (say or (lambda line: None))(f"{plan.name}: {room.num_states} states, rendering with {backend}")
     report = progress or (lambda what, done, total: None)
-    frames = _Frames(plan, room, out, backend)
+    versions = {name: metadata.version(name) for name in ("mitsuba", "mitsuba-oidn")}
+    frames = Frames(plan, room, out, {"variant": backend.variant, **versions})
     began = time.monotonic()
-    report("frames", frames.done(), room.num_states)
-    if not frames.complete():
+    report("frames", frames.done, room.num_states)
+    if not frames.complete:
         renderer = Renderer(mi, build_scene(mi, plan, catalogue), plan.camera)
         began = time.monotonic()
-        frames.render(renderer, lambda: report("frames", frames.done(), room.num_states))
+        frames.render(renderer.frame, lambda: report("frames", frames.done, room.num_states))
     seconds = (time.monotonic() - began) / frames.rendered if frames.rendered else None
-    exposure = frames.exposure or exposure_of(frames.probes.read())
     features, described, features_log = encode_in_steps(
-        lambda first, last: frames.frames.read(first, last),
+        frames.read,
         room.num_states,
         network,
         out.with_name(f".{out.name}.features"),
@@ -242,8 +188,8 @@ def render_room(
         "rotation": room.rotation,
         "shortest_path_distance": shortest_path_distances(room.graph).numpy(),
     }
-    attributes = {**_attributes(plan, catalogue, backend, exposure), **described}
-    pictures = frames.frames.read()
+    attributes = {**_attributes(plan, catalogue, backend, frames.exposure), **described}
+    pictures = frames.read(0, room.num_states)
     write(out, arrays, name=plan.name, actions=default_actions(4), attributes=attributes, pictures=pictures)
     frames.remove()
     features_log.remove()
