@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import h5py
@@ -119,6 +120,13 @@ def test_bfloat16_is_used_only_where_it_is_as_good(square: np.ndarray) -> None:
     assert not np.array_equal(full, half)
     assert np.array_equal(encode_pictures(square, bad, bfloat16=True), encode_pictures(square, bad))
 
+    def mixed(images: torch.Tensor) -> torch.Tensor:
+        found = good.network(images)
+        found[-1] = bad.network(images)[-1]
+        return found
+
+    assert not bfloat16_is_as_good(square, replace(good, network=mixed))  # every picture counts
+
 
 def test_a_scene_is_encoded_and_keeps_the_rest(room_file: Path, square: np.ndarray, tmp_path: Path) -> None:
     seen: list[tuple[int, int]] = []
@@ -184,6 +192,26 @@ def test_a_stopped_run_goes_on(room_file: Path, tmp_path: Path, stop_at: int) ->
     assert calls == {1: [1, 6, 4], 2: [1, 4]}[stop_at]
     assert target.read_bytes() == (tmp_path / "whole.h5").read_bytes()
     assert sorted(path.name for path in tmp_path.iterdir()) == ["new.h5", "room.h5", "whole.h5"]
+
+
+def test_a_torn_batch_is_computed_again_as_a_whole(room_file: Path, tmp_path: Path) -> None:
+    target, sizes = tmp_path / "new.h5", []
+
+    def stop(done: int, total: int) -> None:
+        if done == 12:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        encode_scene(room_file, target, SMALL, batch=6, progress=stop)
+    (log,) = tmp_path.glob(".new.h5.encode")
+    log.write_bytes(log.read_bytes()[:-5])  # the machine died while it wrote
+
+    def counting(images: torch.Tensor) -> torch.Tensor:
+        sizes.append(len(images))
+        return thumbnail(images)
+
+    encode_scene(room_file, target, replace(SMALL, network=counting), batch=6)
+    assert sizes == [1, 6, 4]
 
 
 @pytest.mark.parametrize("change", ["weights", "source"])

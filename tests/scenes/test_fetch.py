@@ -159,6 +159,30 @@ def test_a_run_that_was_stopped_is_taken_up_by_the_next(serve: Callable, tmp_pat
     assert hidden(tmp_path) == []
 
 
+def test_a_server_that_always_breaks_off_still_gets_there(serve: Callable, tmp_path: Path) -> None:
+    server, pauses = serve(CONTENT), []
+    server.mood = ["truncate"] * 3  # as many as the attempts, but each brings something new
+    download(server.url, tmp_path / "f", QUICK, sleep=pauses.append)
+    assert (tmp_path / "f").read_bytes() == CONTENT
+    assert pauses == [0.01] * 3
+
+
+def test_what_one_address_gave_is_not_joined_with_another(serve: Callable, tmp_path: Path) -> None:
+    one, two = serve(CONTENT), serve(CONTENT[::-1])
+    with pytest.raises(SceneError):
+        _until_it_fails(one, tmp_path)
+    download(two.url, tmp_path / "f", QUICK)
+    assert (tmp_path / "f").read_bytes() == CONTENT[::-1]
+    assert two.asked == [None]
+
+
+def test_a_weak_etag_does_not_name_the_bytes(serve: Callable, tmp_path: Path) -> None:
+    server = serve(CONTENT)
+    server.etag, server.mood = 'W/"one"', ["truncate"]
+    download(server.url, tmp_path / "f", QUICK)
+    assert server.asked == [None, None]
+
+
 @pytest.mark.parametrize("change", ["etag", "no ranges", "no etag", "beyond", "other part"])
 def test_parts_of_different_files_are_never_joined(serve: Callable, tmp_path: Path, change: str) -> None:
     server = serve(CONTENT)
@@ -251,6 +275,16 @@ def test_scenes_arrive_and_the_archive_goes(
     asked = len(server.asked)
     fetch(described(server.url), tmp_path / "out")
     assert len(server.asked) == asked  # nothing to do the second time
+
+
+def test_what_a_mac_adds_to_an_archive_is_passed_over(
+    serve: Callable, tmp_path: Path, rooms: dict[str, bytes]
+) -> None:
+    buffer = io.BytesIO(packed(rooms))
+    with zipfile.ZipFile(buffer, "a") as file:
+        file.writestr("__MACOSX/kitchen_02.h5", b"fork")
+    found = fetch(described(serve(buffer.getvalue()).url), tmp_path / "out")
+    assert found[0].read_bytes() == rooms["kitchen_02"]
 
 
 @pytest.mark.parametrize("trouble", ["corrupt", "truncated archive", "404"])

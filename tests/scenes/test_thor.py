@@ -163,6 +163,7 @@ def test_an_export_that_dies_goes_on_and_gives_the_same(
         export(dying, tmp_path / "room.h5", name="x", backbone=THUMBNAIL)
     assert not (tmp_path / "room.h5").exists()
     second, visited = StandIn(room), []
+    second.noise = np.random.default_rng(1)  # the last digits differ from run to run
     resumed = export(
         second,
         tmp_path / "room.h5",
