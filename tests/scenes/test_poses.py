@@ -10,7 +10,7 @@ import torch
 
 from vusfa.scenes import Scene
 from vusfa.scenes.poses import places, spread_poses, step_length
-from vusfa.scenes.sheet import draw_sheet, save_sheet
+from vusfa.scenes.sheet import draw_floor, draw_sheet, save_sheet
 from vusfa.scenes.summary import summarise
 
 
@@ -103,3 +103,35 @@ def test_a_sheet_shows_the_scenes_pictures(make_scene: Callable[..., Scene], tmp
     candidates = ahead.nonzero().squeeze(1)
     chosen = candidates[spread_poses(scene.location[ahead], scene.rotation[ahead], 5)]
     assert seen == sorted(chosen.tolist())
+
+
+def test_the_floor_has_every_place_and_pose_where_it_is() -> None:
+    """Two places half a metre apart, two headings at the first; the second is an island."""
+    from matplotlib.colors import to_hex
+    from matplotlib.figure import Figure
+
+    location = torch.tensor([[1.0, 2.0], [1.0, 2.0], [1.5, 2.0]])
+    scene = Scene(
+        "two", torch.tensor([[1], [0], [2]]), torch.rand(3, 1, 2), location, torch.tensor([0, 90, 180])
+    )
+    axis = Figure().subplots()
+    draw_floor(axis, scene, shown=[1])
+    squares, darts = axis.collections
+    corners = sorted(path.get_extents().extents.tolist() for path in squares.get_paths())
+    assert corners == [pytest.approx([0.75, 1.75, 1.25, 2.25]), pytest.approx([1.25, 1.75, 1.75, 2.25])]
+    # Darts lie within their place, ahead of its middle, and point where the pose looks: +Z, +X, -Z.
+    ahead = torch.tensor([[0.0, 1.0], [1.0, 0.0], [0.0, -1.0]]).double()
+    tails, points = (
+        torch.tensor(darts.get_offsets()),
+        torch.stack([torch.tensor(darts.U), torch.tensor(darts.V)], 1),
+    )
+    assert torch.allclose(tails - location, ahead * 0.06, atol=1e-6)
+    assert torch.allclose(points, ahead * 0.13, atol=1e-6)
+    grey, blue, red = (to_hex(colour) for colour in darts.get_facecolors())
+    assert len({grey, blue, red}) == 3
+    assert (blue, red) == ("#1f61b2", "#d6452c"), "shown; cut off"
+    (number,) = axis.texts
+    assert number.get_text() == "1"
+    assert number.get_position() == pytest.approx((1.15, 2.0))
+    assert axis.get_xlim() == pytest.approx((0.5, 2.0))
+    assert axis.get_ylim() == pytest.approx((1.5, 2.5))

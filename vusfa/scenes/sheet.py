@@ -24,7 +24,7 @@ from vusfa.scenes.scene import Scene
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-__all__ = ["draw_sheet", "save_sheet"]
+__all__ = ["draw_floor", "draw_sheet", "save_sheet"]
 
 _FLOOR, _EDGE, _POSE, _ISLAND, _SHOWN = "#dde0e6", "#bcc1cb", "#7f93b2", "#d6452c", "#1f61b2"
 _COLUMNS = 4
@@ -62,9 +62,9 @@ def draw_sheet(scene: Scene, count: int = 12) -> bytes:
         halves: Any = figure.subfigures(1, 2, width_ratios=[1.25, 1])
         sheet, floor = halves
         _draw_pictures(sheet.subplots(rows, _COLUMNS, squeeze=False).ravel(), scene, shown)
-        _draw_floor(floor.subplots(), scene, shown)
+        draw_floor(floor.subplots(), scene, shown)
     else:
-        _draw_floor(figure.subplots(), scene, shown)
+        draw_floor(figure.subplots(), scene, shown)
     figure.supxlabel(_footer(scene), fontsize=7, color="#555555")
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", metadata={"Software": None})
@@ -121,7 +121,8 @@ def _draw_pictures(axes: np.ndarray, scene: Scene, shown: Sequence[int]) -> None
         axis.set_title(f"{number}: state {state}", fontsize=9)
 
 
-def _draw_floor(axis: Axes, scene: Scene, shown: Sequence[int]) -> None:
+def draw_floor(axis: Axes, scene: Scene, shown: Sequence[int]) -> None:
+    """Draw a scene's floor from above, in metres, with a dart for every pose and numbers at those shown."""
     from matplotlib.collections import PatchCollection
     from matplotlib.patches import Rectangle
 
