@@ -23,11 +23,18 @@ def test_a_plan_or_a_kind_must_be_given(run: Callable[..., Any], tmp_path: Path)
     for options in ([], ["--kind", "hall", "--plan", "x.yaml"]):
         result = run("render", *options)
         assert result.exit_code == 1
-        assert "either by --plan FILE or by --kind KIND" in result.stderr
+        assert "--plan FILE, --kind KIND or --flat KIND,KIND" in result.stderr
     save_plan(layout("bathroom", 2), tmp_path / "x.yaml")
     result = run("render", "--plan", tmp_path / "x.yaml", "--cells", 40, "-o", tmp_path / "x.h5")
-    assert "--cells belongs to --kind" in result.stderr
+    assert "--cells belongs to --kind and --flat" in result.stderr
     assert "no kind of room is called 'attic'" in run("render", "--kind", "attic").stderr
+
+
+def test_a_flat_is_one_plan(run: Callable[..., Any], tmp_path: Path) -> None:
+    target = tmp_path / "flat.yaml"
+    options = ["--flat", "bathroom, hall", "--cells", 60, "--plan-only", "-o", target]
+    assert run("render", *options).exit_code == 0
+    assert load_plan(target).kind == "flat: bathroom, hall"
 
 
 def test_nothing_is_replaced_without_force(run: Callable[..., Any], tmp_path: Path) -> None:

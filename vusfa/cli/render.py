@@ -20,16 +20,19 @@ def register(scenes: typer.Typer) -> None:
     scenes.command("render")(render)
 
 
-def _plan(plan: Path | None, kind: str | None, seed: int, cells: int | None) -> Plan:
+def _plan(plan: Path | None, kind: str | None, flat: str | None, seed: int, cells: int | None) -> Plan:
+    from vusfa.scenes.render.flat import flat as draw_flat
     from vusfa.scenes.render.layout import layout
     from vusfa.scenes.render.plan_file import load_plan
 
-    if (plan is None) == (kind is None):
-        raise ConfigError("say what to render, either by --plan FILE or by --kind KIND")
+    if sum(given is not None for given in (plan, kind, flat)) != 1:
+        raise ConfigError("say what to render: --plan FILE, --kind KIND or --flat KIND,KIND,...")
     if plan is not None:
         if cells is not None:
-            raise ConfigError("--cells belongs to --kind; a plan has its size")
+            raise ConfigError("--cells belongs to --kind and --flat; a plan has its size")
         return load_plan(plan)
+    if flat is not None:
+        return draw_flat([room.strip() for room in flat.split(",")], seed, cells)
     assert kind is not None
     return layout(kind, seed, cells)
 
@@ -38,6 +41,9 @@ def render(
     plan: Annotated[Path | None, typer.Option(help="Plan of the room, a YAML file.")] = None,
     kind: Annotated[
         str | None, typer.Option(help="Draw a bathroom, bedroom, kitchen, living_room or hall.")
+    ] = None,
+    flat: Annotated[
+        str | None, typer.Option(help="Draw two to five rooms in a row as one scene: kitchen,hall,bedroom.")
     ] = None,
     seed: Annotated[int, typer.Option(help="What it is drawn from: the same seed, the same room.")] = 1,
     cells: Annotated[
@@ -57,7 +63,7 @@ def render(
     weights: Annotated[Path | None, typer.Option(help="Its weights, where they are a file of yours.")] = None,
     force: Annotated[bool, typer.Option("--force", help="Replace the file if there is one.")] = False,
 ) -> None:
-    """Render a room: from its plan, or drawn and furnished from a kind and a seed.
+    """Render a room or a flat: from its plan, or drawn and furnished from a kind and a seed.
 
     Needs `pip install 'vusfa[render]'` and furniture: Debian's package sweethome3d-furniture, or a folder of
     Sweet Home 3D's .sh3f libraries named by SH3D_FURNITURE. With LLVM 16 or later (Debian: libllvm19) it is
@@ -72,15 +78,17 @@ def render(
         vusfa scenes render --kind kitchen --seed 2 --cells 120 --plan-only -o kitchen.yaml
 
         vusfa scenes render --plan kitchen.yaml -o kitchen.h5
+
+        vusfa scenes render --flat kitchen,hall,bedroom,bathroom --cells 500
     """
     from vusfa.scenes.render.grid import poses
     from vusfa.scenes.render.plan_file import save_plan
 
-    name = plan.stem if plan is not None else f"{kind}-{seed}"
+    name = plan.stem if plan is not None else f"{kind or 'flat'}-{seed}"
     target = output or Path(f"{name}.yaml" if plan_only else f"{name}.h5")
     if target.exists() and not force:
         raise SceneError(f"{target}: exists; choose another name with -o, or replace it with --force")
-    room = _plan(plan, kind, seed, cells)
+    room = _plan(plan, kind, flat, seed, cells)
     if plan_only:
         from vusfa.scenes.render.catalogue import Catalogue
 

@@ -1,7 +1,8 @@
 """Which of Mitsuba's variants to render with: LLVM where one is found that works, otherwise plain C++.
 
-LLVM is about ten times faster (0.5 against 4.4 seconds of processor time a frame), but some versions of it crash (LLVM 15 does with Mitsuba 3.9), so each
-candidate first traces a small scene in a process of its own. ``DRJIT_LIBLLVM_PATH`` names one to try first.
+LLVM is about ten times faster (0.5 against 4.4 seconds of processor time a frame), but some versions of it
+crash (LLVM 15 does with Mitsuba 3.9), so each candidate first traces a small scene in a process of its own.
+``DRJIT_LIBLLVM_PATH`` names one to try first.
 """
 
 from __future__ import annotations
@@ -50,7 +51,7 @@ class Backend:
 
     def __str__(self) -> str:
         if self.library is None:
-            return f"{self.variant} (no working LLVM found; install LLVM 16 or later to be about ten times faster)"
+            return f"{self.variant} (no working LLVM found; LLVM 16 or later is about ten times faster)"
         return f"{self.variant} ({self.library})"
 
 

@@ -22,7 +22,7 @@ from vusfa.scenes.render.kinds import CEILING, Programme, programme
 from vusfa.scenes.render.outline import Rect
 from vusfa.scenes.render.plan import Grid, Light, Plan, Solid, Surfaces
 
-__all__ = ["best_lamps", "layout", "room_seed", "scaled"]
+__all__ = ["best_lamps", "lamps_of", "layout", "room_seed", "room_size", "scaled"]
 
 #: Metres from a wall to the first places of the grid.
 MARGIN = 0.3
@@ -155,12 +155,17 @@ def best_lamps(places: np.ndarray, solids: list[Rect]) -> list[int]:
 _RADIANCE = ((14.0, 13.4, 12.2), (13.0, 12.8, 12.6))
 
 
+def lamps_of(cells: list[tuple[int, int]], solids: list[Rect]) -> tuple[Light, ...]:
+    """Ceiling lamps for a room with these free places, above :func:`best_lamps`."""
+    places = MARGIN + _GRID.step * np.array(cells, dtype=np.float64)
+    lit = [(round(float(x), 4), round(float(z), 4)) for x, z in places[best_lamps(places, solids)]]
+    return tuple(Light(at, radiance=_RADIANCE[k]) for k, at in enumerate(lit))
+
+
 def as_plan(
     draft: Draft, name: str, kind: str, seed: int, surfaces: Surfaces, cells: list[tuple[int, int]]
 ) -> Plan:
     """A finished draft as a plan, lamps put up."""
-    places = MARGIN + _GRID.step * np.array(cells, dtype=np.float64)
-    lamps = [places[k].tolist() for k in best_lamps(places, list(draft.solids))]
     # Not rounded: a wall's number of pixels, and so all colours drawn after it, hang on the last digit.
     solids = tuple(Solid(tuple(float(edge) for edge in rect)) for rect in draft.solids)  # type: ignore[arg-type]
     return Plan(
@@ -173,9 +178,7 @@ def as_plan(
         furniture=tuple(item.furniture() for item in (*draft.items, *draft.fixtures)),
         pictures=tuple(draft.pictures),
         windows=tuple(draft.windows),
-        lights=tuple(
-            Light((round(x, 4), round(z, 4)), radiance=_RADIANCE[min(k, 1)]) for k, (x, z) in enumerate(lamps)
-        ),
+        lights=lamps_of(cells, list(draft.solids)),
     )
 
 
