@@ -46,9 +46,17 @@ def test_paper_goals_of_a_scene_that_is_called_as_the_papers(make_scene: Callabl
     assert resolve_goals(scenes, "paper").tolist() == [26, 37, 43, 53, 69]
 
 
-def test_paper_goals_of_another_scene_are_an_error(scenes: SceneSet) -> None:
-    with pytest.raises(GoalError, match=r"'paper' know nothing of scene 'hall'.*random:5"):
-        resolve_goals(scenes, "paper")
+def test_paper_goals_of_any_other_scene_are_spread_by_the_rule_of_the_bundled_rooms(
+    make_scene: Callable[..., Scene],
+) -> None:
+    scenes = SceneSet([make_scene("hall"), Scene("pair", *_pair())])
+    hall = spread_goals(scenes.scenes[0], 5)
+    assert len(set(hall)) == 5
+    assert resolve_goals(scenes, "paper").tolist() == hall + [16, 17]  # only two states: both are goals
+
+
+def _pair() -> tuple[torch.Tensor, torch.Tensor]:
+    return torch.tensor([[1, -1, -1, -1], [0, -1, -1, -1]]), torch.rand(2, 1, 8)
 
 
 def test_a_paper_goal_that_the_scene_does_not_have(make_scene: Callable[..., Scene]) -> None:

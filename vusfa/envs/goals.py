@@ -3,7 +3,8 @@
 A goal set is written down in one of these forms, everywhere that goals can be given:
 
 =================  =======================================================================================
-``"paper"``        the goals of ``manifests/paper.yaml``: the paper's 20, and five for each bundled room
+``"paper"``        the goals of ``manifests/paper.yaml``: the paper's 20, and five for each bundled room;
+                   for any other scene five chosen by the bundled rooms' rule, :func:`spread_goals`
 ``"all"``          every state that some other state can reach
 ``"random:5"``     that many such states of each scene, drawn once and for all; "random:5:1" is another draw
 ``"my.yaml"``      a manifest: the names of scenes, each with a list of state ids within the scene
@@ -185,13 +186,11 @@ def _by_scene(scenes: SceneSet, goals: Mapping[str, Any], source: str) -> Tensor
 
 def _paper(scenes: SceneSet) -> Tensor:
     manifest = read_manifest(PAPER_MANIFEST)
-    missing = [name for name in scenes.names if name not in manifest]
-    if missing:
-        raise GoalError(
-            f"goals 'paper' know nothing of scene {missing[0]!r}, only of {', '.join(manifest)};"
-            " give goals='random:5', state ids, or a manifest of your own"
-        )
-    return _by_scene(scenes, {name: manifest[name] for name in scenes.names}, "goals 'paper'")
+    goals = {}
+    for scene in scenes.scenes:
+        largest = len(strong_components(scene.graph)[0])
+        goals[scene.name] = manifest.get(scene.name) or spread_goals(scene, min(5, largest))
+    return _by_scene(scenes, goals, "goals 'paper'")
 
 
 def _reachable(scene: Scene) -> Tensor:
