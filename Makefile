@@ -9,8 +9,8 @@ STAMP := $(VENV)/.installed-dev
 help:  ## list the targets
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/'
 
-# One set of tested versions for everybody: constraints.txt. On Linux it names torch's CPU build by version alone;
-# for a GPU install another build of torch into .venv afterwards.
+# One set of tested versions for everybody: constraints.txt. It names torch by version alone and pip takes the build that it
+# finds first; to have another build (for a GPU, or a small one for processors only) install that into .venv first.
 $(STAMP): pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt torch

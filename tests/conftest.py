@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import signal
 import zlib
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -12,6 +13,11 @@ import torch
 import torch.multiprocessing
 
 from vusfa.scenes import Scene
+
+# A program that a shell script started in the background ignores Ctrl-C, and so do those that it starts. What
+# the tests say of interruptions shall hold there, too.
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 _RECORDED = Path(__file__).parent / "golden"
 
