@@ -77,7 +77,11 @@ def test_an_unreachable_goal(run, tmp_path: Path):
     Scene("trap", torch.tensor([[1, -1], [0, -1], [0, -1]]), torch.rand(3, 1, 4)).save(tmp_path / "trap.h5")
     for kind in ("single", "multi_async"):
         text = run(
-            f"scenes=[{tmp_path / 'trap.h5'}]", "env.goals=[2]", f"collector={kind}", "agent.hidden_size=8"
+            f"scenes=[{tmp_path / 'trap.h5'}]",
+            "env.goals=[2]",
+            f"collector={kind}",
+            "agent.hidden_size=8",
+            "evaluation=none",
         )
         assert "scene 'trap': no other state can reach goal 2" in text
 
@@ -113,10 +117,49 @@ def test_an_unknown_scene(run):
         ("agent.memory=gru", "memory is 'gru'"),
         ("device=gpu", "device is 'gpu'"),
         ("threads=0", "threads is 0; give 1 or more"),
+        ("+objective.foo=1", "no setting is called 'objective.foo'"),
+        ("+foo=1", "no setting is called 'foo'"),
+        ("++agnt.model=gvf", "no setting is called 'agnt.model'; did you mean 'agent.model'?"),
+        ("+optim.foo=1", "no setting is called 'optim.foo'"),
+        ("+evaluation.foo=1", "no setting is called 'evaluation.foo'"),
+        ("+logger.foo=1", "no setting is called 'logger.foo'"),
+        ("+agent.histroy=1", "no field 'histroy'; did you mean 'history'?"),
+        ("+optim.options.foo=1", "optim.kind=adam does not take"),
+        ("log_every=0", "log_every is 0; it must be more than 0"),
+        ("checkpoint_every=-5", "checkpoint_every is -5; it must be more than 0"),
+        ("optim.horizon=0", "optim.horizon is 0; it must be more than 0"),
+        ("entropy.horizon=-1", "entropy.horizon is -1; it must be more than 0"),
+        ("objective.n_steps=abc", "objective.n_steps is 'abc'; it must be a whole number or null"),
+        ("objective.bottleneck_maximum=abc", "objective.bottleneck_maximum is 'abc'; it must be a number"),
+        ("env.collision_reward=abc", "env.collision_reward is 'abc'; it must be a number or null"),
+        ("agent.initial_scale=abc", "agent.initial_scale is 'abc'; it must be a number"),
+        ("scenes=null", "scenes is null; it must be a list, such as [bathroom"),
+        ("scenes=[1]", "scenes is [1]; each entry must be as in [bathroom"),
+        ("logger.kinds=null", "logger.kinds is null; it must be a list, such as [csv]"),
+        ("logger.kinds=csv", "logger.kinds is 'csv'; it must be a list, such as [csv]"),
+        ("optim.options=null", "optim.options is null; it is a group of settings: give optim.options.eps="),
+        ("agent.model=null", "model is 'null'; it must be one of"),
+        ("agent.model=null preset=paper", "model is 'null'; it must be one of"),
     ],
 )
 def test_an_unknown_key_or_value(run, argument: str, words: str):
     assert words in run(*argument.split())
+
+
+@pytest.mark.parametrize("key", ["optim.horizon", "entropy.horizon", "optim.max_grad_norm"])
+def test_a_documented_null_is_taken(
+    recipe,
+    small,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capfd: pytest.CaptureFixture[str],
+    key: str,
+):
+    arguments = [*small, "total_frames=48", f"folder={tmp_path / 'run'}", f"{key}=null"]
+    monkeypatch.setattr("sys.argv", ["train.py", *arguments])
+    with pytest.raises(SystemExit) as end:
+        launch(recipe("train").main, RECIPES / "conf", "train")
+    assert end.value.code == 0, capfd.readouterr().err
 
 
 def test_a_damaged_checkpoint(run, tmp_path: Path):

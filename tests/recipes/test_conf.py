@@ -7,6 +7,7 @@ import shlex
 from pathlib import Path
 
 import pytest
+from omegaconf import OmegaConf
 
 from vusfa.training.launch import compose
 
@@ -91,4 +92,34 @@ def test_the_command_line_wins_over_the_preset(settings):
 
 
 def test_a_preset_does_not_depend_on_the_one_before(settings):
-    assert settings("preset=controlled") == settings()
+    assert settings("preset=controlled", "folder=here") == settings("folder=here")
+
+
+def test_the_numbers_of_controlled(settings):
+    cfg = settings()
+    assert cfg.optim == {
+        "kind": "adam",
+        "lr": 5e-4,
+        "horizon": 1_000_000,
+        "max_grad_norm": 1.0,
+        "options": {"eps": 1e-5},
+    }
+    assert cfg.collector == {"kind": "single", "num_envs": 64, "rollout": 20, "num_workers": 1}
+    assert cfg.env.goal_sampling == "episode"
+    assert cfg.entropy == {"start": 0.08, "end": 0.008, "horizon": 1_000_000}
+
+
+@pytest.mark.parametrize("preset", ["controlled", "paper", "reference"])
+@pytest.mark.parametrize("optim", ["adam", "rmsprop", "tf_rmsprop"])
+def test_a_chosen_optimiser_comes_with_its_numbers(settings, preset: str, optim: str):
+    cfg = settings(f"preset={preset}", f"optim={optim}", "total_frames=5000")
+    written = OmegaConf.load(CONF / "optim" / f"{optim}.yaml")
+    assert cfg.optim == OmegaConf.merge({"total_frames": 5000, "optim": written}).optim
+
+
+@pytest.mark.parametrize("collector", ["single", "multi_sync", "multi_async"])
+def test_a_chosen_collector_comes_with_its_numbers(settings, collector: str):
+    chosen = f"collector={collector}"
+    assert settings(chosen).collector == OmegaConf.load(CONF / "collector" / f"{collector}.yaml")
+    cfg = settings(chosen, "preset=paper", "agent.model=gvf")
+    assert (cfg.collector.kind, cfg.collector.num_envs, cfg.collector.rollout) == (collector, 100, 5)

@@ -12,11 +12,10 @@ The one part of this package that needs Hydra (extra ``recipes``). A recipe is a
 
 from __future__ import annotations
 
-import difflib
 import os
 import re
 import sys
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -28,12 +27,13 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from vusfa.errors import ConfigError, VusfaError
+from vusfa.errors import VusfaError
 from vusfa.modules.presets import resolve_config
 from vusfa.training.checkpoint import load_checkpoint
+from vusfa.training.checks import check_names, check_types, near
 from vusfa.training.loggers import flat
 
-__all__ = ["check_types", "compose", "launch", "with_saved_overrides"]
+__all__ = ["compose", "launch", "with_saved_overrides"]
 
 BAD_INPUT = 2
 INTERRUPTED = 130
@@ -47,7 +47,7 @@ def launch(job: Callable[[DictConfig, list[str]], int], folder: Path, name: str)
     standard error and code 2. An error of ours keeps its traceback.
 
     Args:
-        job: gets the settings, resolved and with their types checked, and the command line's overrides.
+        job: gets the settings, resolved and checked, and the command line's overrides.
         folder: of the configuration files.
         name: the primary one.
     """
@@ -59,6 +59,7 @@ def launch(job: Callable[[DictConfig, list[str]], int], folder: Path, name: str)
         # Errors are reported in here: one that passed through Hydra would get lines of Hydra's around it.
         # As typed: one with an interpolation would be resolved by being looked at.
         overrides: Any = OmegaConf.to_container(HydraConfig.get().overrides.task, resolve=False)
+        overrides.insert(0, f"--config-name={HydraConfig.get().job.config_name}")  # train resumes demo
         codes.append(_report(lambda: job(_settled(cfg, folder, name), overrides), folder, name))
 
     def run() -> int:
@@ -84,7 +85,8 @@ def compose(folder: Path, name: str, overrides: Sequence[str] = ()) -> DictConfi
 
 
 def with_saved_overrides(arguments: Sequence[str]) -> list[str]:
-    """The command line of a resumed run: that of the run it resumes, then what was given now.
+    """The command line of a resumed run: that of the run it resumes, of whichever recipe, then what was given
+    now.
 
     ``resume=RUN/checkpoint.pt`` alone continues with the same settings, in the same folder. What is given now
     wins.
@@ -99,32 +101,13 @@ def with_saved_overrides(arguments: Sequence[str]) -> list[str]:
     if not paths or paths[-1] in ("", "null"):
         return list(arguments)
     given = {"folder", *_keys(arguments)}
-    saved = load_checkpoint(paths[-1]).get("overrides", [])
-    kept = [override for override in saved if override.partition("=")[0].lstrip("+~") not in given]
-    return [*kept, f"folder='{Path(paths[-1]).resolve().parent}'", *arguments]
-
-
-def check_types(cfg: Mapping[str, Any], defaults: Mapping[str, Any]) -> None:
-    """Refuse a word where the default is a number, a fraction where it is a whole number, and so on.
-
-    Raises:
-        ConfigError: naming the setting, its value, and a value that would do.
-
-    >>> check_types({"optim": {"lr": "fast"}}, {"optim": {"lr": 0.1}})
-    Traceback (most recent call last):
-    ...
-    vusfa.errors.ConfigError: optim.lr is 'fast'; it must be a number, such as 0.1
-    """
-    expected = flat(defaults)
-    for key, value in flat(cfg).items():
-        default = expected.get(key)
-        for kind, accepted, words in (
-            (bool, (bool,), "true or false"),
-            (int, (int,), f"a whole number, such as {default}"),
-            (float, (int, float), f"a number, such as {default}"),
-        ):
-            if type(default) is kind and type(value) not in accepted:
-                raise ConfigError(f"{key} is {value!r}; it must be {words}")
+    state = load_checkpoint(paths[-1])
+    sources = state["scenes"].get("sources", [])  # as they are found from any folder
+    kept = [override for override in state.get("overrides", []) if not _keys([override]) & given]
+    if sources and "scenes" not in given:
+        kept = [override for override in kept if _keys([override]) != {"scenes"}]
+        kept.append(f"scenes=[{','.join(map(_quoted, sources))}]")
+    return [*kept, f"folder={_quoted(Path(paths[-1]).resolve().parent)}", *arguments]
 
 
 def explain(error: Exception, folder: Path, name: str) -> str:
@@ -136,34 +119,31 @@ def explain(error: Exception, folder: Path, name: str) -> str:
     if isinstance(error, MissingConfigException) and "Available options" in str(error):
         wanted = (error.missing_cfg_file or "").rpartition("/")
         options = sorted(option.strip() for option in error.options or ())
-        return f"{wanted[0]}={wanted[2]}: there is no such choice{_near(wanted[2], options)}"
+        return f"{wanted[0]}={wanted[2]}: there is no such choice{near(wanted[2], options)}"
     unknown = re.match(r"Could not override '([^']+)'", text)
     if unknown:
         GlobalHydra.instance().clear()
         known = compose(folder, name)
         groups = [entry.name for entry in folder.iterdir() if entry.is_dir()]
         keys = [*flat(OmegaConf.to_container(known)), *groups]  # type: ignore[arg-type]
-        return f"no setting is called {unknown[1]!r}{_near(unknown[1], keys)}"
+        return f"no setting is called {unknown[1]!r}{near(unknown[1], keys)}"
     return text
+
+
+def _quoted(path: object) -> str:
+    return "'" + str(path).replace("'", "\\'") + "'"
 
 
 def _keys(overrides: Iterable[str]) -> set[str]:
     return {override.partition("=")[0].lstrip("+~") for override in overrides}
 
 
-def _near(word: str, choices: Iterable[str]) -> str:
-    choices = list(choices)
-    near = difflib.get_close_matches(word, choices, n=1, cutoff=0.5)
-    if near:
-        return f"; did you mean {near[0]!r}?"
-    return f"; there are {', '.join(choices)}" if len(choices) <= 12 else "; --help lists all settings"
-
-
 def _settled(cfg: DictConfig, folder: Path, name: str) -> DictConfig:
-    """Interpolations resolved, types checked."""
+    """Interpolations resolved, names and types checked."""
     model = OmegaConf.select(cfg, "agent.model")
-    if model is not None:
-        resolve_config(model)  # before anything is looked up by the model's name
+    if "agent" in cfg:
+        # before anything is looked up by the model's name
+        resolve_config("null" if model is None else str(model))
     OmegaConf.resolve(cfg)
     context = HydraConfig.get()
     if context.mode == RunMode.MULTIRUN and "folder" in cfg and "folder" not in _keys(context.overrides.task):
@@ -173,7 +153,9 @@ def _settled(cfg: DictConfig, folder: Path, name: str) -> DictConfig:
     groups = [f"{group}={choice}" for group, choice in choices.items() if not group.startswith("hydra/")]
     defaults = compose(folder, name, [*groups, *([f"agent.model={model}"] if model is not None else [])])
     OmegaConf.resolve(defaults)
-    check_types(OmegaConf.to_container(cfg), OmegaConf.to_container(defaults))  # type: ignore[arg-type]
+    given, expected = OmegaConf.to_container(cfg), OmegaConf.to_container(defaults)
+    check_names(given, expected)  # type: ignore[arg-type]
+    check_types(given, expected)  # type: ignore[arg-type]
     return cfg
 
 
@@ -184,6 +166,10 @@ def _report(job: Callable[[], int], folder: Path, name: str) -> int:
         return _complain(str(error))
     except (HydraException, OmegaConfBaseException) as error:
         return _complain(explain(error, folder, name))
+    except ValueError as error:
+        if "Config group override" not in str(error):  # Hydra's, of optim=null
+            raise
+        return _complain("a group of settings cannot be null; --help lists the choices of each")
     except KeyboardInterrupt:
         return _complain("interrupted; a checkpoint written before this is whole", INTERRUPTED)
 
