@@ -23,15 +23,11 @@ def demo(cfg: DictConfig, overrides: list[str]) -> int:
     if result is None:
         return exit_code
     folder, agent, scenes = Path(cfg.folder), session.agent.eval(), session.scenes
-    floor = next(row for row in result.rows if row["policy"] == "random walk" and row["goals"] == "trained")
-    made = [
-        plot_curve(
-            folder / "metrics.csv",
-            folder / "curve.png",
-            floor[f"success_{cfg.evaluation.max_steps}"],
-            cfg.agent.model,
-        )
-    ]
+    made, within = [], f"success_{cfg.evaluation.max_steps}"
+    if (folder / "metrics.csv").is_file():  # nothing is logged when there was nothing left to train
+        floors = [row for row in result.rows if (row["policy"], row["goals"]) == ("random walk", "trained")]
+        floor = floors[0][within] if floors else None
+        made.append(plot_curve(folder / "metrics.csv", folder / "curve.png", floor, cfg.agent.model))
     found = longest_success(result.episodes, scenes)
     if found is not None:
         start, goal = found

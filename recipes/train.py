@@ -17,7 +17,8 @@ import torch
 from omegaconf import DictConfig, OmegaConf
 
 from vusfa.envs import resolve_goals
-from vusfa.evaluation import Comparison, compare, print_summary
+from vusfa.evaluation import Comparison, check_comparison, compare, print_summary
+from vusfa.evaluation.files import check_folder
 from vusfa.modules import make_agent
 from vusfa.scenes import SceneSet
 from vusfa.training import (
@@ -55,7 +56,7 @@ def train(cfg: DictConfig, overrides: list[str]) -> tuple[Session, Comparison | 
     """
     set_threads(cfg.threads)
     torch.manual_seed(cfg.seed)
-    device, checkpoint = torch_device(cfg.device), Path(cfg.folder) / "checkpoint.pt"
+    device, checkpoint = torch_device(cfg.device), check_folder(cfg.folder, "folder") / "checkpoint.pt"
     plain: dict[str, Any] = OmegaConf.to_container(cfg, resolve=True)  # type: ignore[assignment]
     optim = plain["optim"]
     half = partial(torch.autocast, device.type, torch.bfloat16, enabled=cfg.autocast)
@@ -64,6 +65,11 @@ def train(cfg: DictConfig, overrides: list[str]) -> tuple[Session, Comparison | 
     scenes = SceneSet.open(cfg.scenes)
     goals = resolve_goals(scenes, plain["env"]["goals"])
     check_goals_dealt(len(goals), cfg.collector.num_envs, cfg.env.goal_sampling)
+    measured = dict(plain["evaluation"])
+    wanted = measured.pop("goals")
+    wanted = goals if wanted == "trained" else wanted
+    if cfg.evaluation.goals:
+        check_comparison(scenes, wanted, **measured)
     agent = make_agent(scenes=scenes, **{k: v for k, v in plain["agent"].items() if v is not None}).to(device)
     actor, critic = agent.get_policy_operator(), agent.get_value_operator()
     loss, estimator, multiplier = make_loss(
@@ -108,7 +114,8 @@ def train(cfg: DictConfig, overrides: list[str]) -> tuple[Session, Comparison | 
 
                 session.count(batch, {**terms, "grad_norm": norm}, time.monotonic() - began)
                 progress.update(session.frames)
-                if before // cfg.log_every < session.frames // cfg.log_every:
+                ended = session.frames >= cfg.total_frames  # a short training is logged, too
+                if ended or before // cfg.log_every < session.frames // cfg.log_every:
                     metrics = session.metrics()
                     loggers.log_metrics(metrics, session.frames)
                     progress.rates(metrics["success"], metrics["length_ratio"])
@@ -119,9 +126,7 @@ def train(cfg: DictConfig, overrides: list[str]) -> tuple[Session, Comparison | 
 
         result = None
         if cfg.evaluation.goals and not stop.received:
-            options = {**plain["evaluation"], "history": history, "observe": observation}
-            wanted = options.pop("goals")
-            wanted = goals if wanted == "trained" else wanted
+            options = {**measured, "history": history, "observe": observation}
             with EvaluationProgress() as told:
                 policies = {agent.config["model"]: actor}
                 result = compare(policies, scenes, wanted, trained=goals, progress=told, **options)

@@ -17,6 +17,7 @@ import tyro
 
 from vusfa.errors import VusfaError
 from vusfa.evaluation import compare, print_summary
+from vusfa.evaluation.files import check_folder
 from vusfa.training import EvaluationProgress, load_agent, make_observation, rebuild_agent, set_threads
 
 
@@ -50,6 +51,8 @@ def zero_shot(
         out: where to write, without suffix; zero_shot beside the checkpoint when not given.
     """
     set_threads(threads)
+    stem = out or checkpoint.with_name("zero_shot")
+    check_folder(stem.parent, "out")
     agent, scenes, state = load_agent(checkpoint, device=device)
     torch.manual_seed(seed)
     untrained = rebuild_agent(agent.config, scenes).to(device)
@@ -70,7 +73,7 @@ def zero_shot(
             seed=seed,
         )
     print_summary(result.rows, note=result.note)
-    for path in result.save(out or checkpoint.with_name("zero_shot")):
+    for path in result.save(stem):
         print(path)
 
 
@@ -79,3 +82,6 @@ if __name__ == "__main__":
         tyro.cli(zero_shot)
     except VusfaError as error:
         sys.exit(f"error: {error}")
+    except KeyboardInterrupt:
+        print("error: interrupted; nothing has been written", file=sys.stderr)
+        sys.exit(130)

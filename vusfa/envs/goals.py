@@ -148,7 +148,7 @@ def _scenes_and_offsets(scenes: SceneSet) -> list[tuple[Scene, int]]:
 
 
 def _checked_ids(scenes: SceneSet, goals: Any) -> Tensor:
-    ids = torch.as_tensor(goals).cpu()
+    ids = _as_tensor(goals, "goals")
     if ids.ndim != 1 or not len(ids):
         raise GoalError(
             f"goals have the shape {tuple(ids.shape)}; give at least one global state id, as a flat list"
@@ -163,15 +163,34 @@ def _checked_ids(scenes: SceneSet, goals: Any) -> Tensor:
     return ids.to(torch.int64)
 
 
+def _as_tensor(goals: Any, source: str) -> Tensor:
+    """Numbers as a tensor on the CPU; words are not truncated to them, and truth values do not count as 0 and
+    1."""
+    mixed = isinstance(goals, Sequence) and any(isinstance(goal, bool) for goal in goals)
+    try:
+        if mixed:
+            raise TypeError("a truth value")
+        return torch.as_tensor(goals).cpu()
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise GoalError(
+            f"{source}: {goals!r} are no state ids; give a list of them, like [26, 37]"
+        ) from error
+
+
 def _by_scene(scenes: SceneSet, goals: Mapping[str, Any], source: str) -> Tensor:
     unknown = [name for name in goals if name not in scenes.names]
     if unknown:
         raise GoalError(f"{source} name the scene {unknown[0]!r}; this set has {', '.join(scenes.names)}")
     found = []
     for scene, first in _scenes_and_offsets(scenes):
-        ids = torch.as_tensor(goals.get(scene.name, []))
-        if not len(ids):
+        given = goals.get(scene.name, [])
+        ids = _as_tensor(given, f"{source}: scene {scene.name!r}")
+        if ids.ndim == 1 and not len(ids):
             continue
+        if ids.ndim != 1 or ids.is_floating_point() or ids.is_complex() or ids.dtype == torch.bool:
+            raise GoalError(
+                f"{source}: scene {scene.name!r} has {given!r}; give a list of state ids, like [26, 37]"
+            )
         wrong = ids[(ids < 0) | (ids >= scene.num_states)]
         if len(wrong):
             raise GoalError(

@@ -4,7 +4,7 @@ path.
 >>> from vusfa.evaluation import evaluate, summary
 """
 
-from vusfa.evaluation.comparison import Comparison, compare
+from vusfa.evaluation.comparison import Comparison, check_comparison, compare
 from vusfa.evaluation.episodes import Episodes
 from vusfa.evaluation.floors import random_walk, shortest_paths
 from vusfa.evaluation.navigation import episode_starts, evaluate, walk
@@ -13,6 +13,7 @@ from vusfa.evaluation.report import print_summary, random_walk_summary, summary
 __all__ = [
     "Comparison",
     "Episodes",
+    "check_comparison",
     "compare",
     "episode_starts",
     "evaluate",

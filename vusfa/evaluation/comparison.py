@@ -7,18 +7,20 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import torch
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
 from vusfa.envs.goals import resolve_goals
+from vusfa.errors import ConfigError, GoalError
 from vusfa.evaluation.episodes import Episodes
 from vusfa.evaluation.files import write_csv, write_json
 from vusfa.evaluation.floors import shortest_paths
-from vusfa.evaluation.navigation import evaluate
+from vusfa.evaluation.navigation import Unreachable, episode_starts, evaluate
 from vusfa.evaluation.report import count_pairs, random_walk_summary, summary
 from vusfa.scenes import SceneSet
 
-__all__ = ["Comparison", "compare"]
+__all__ = ["Comparison", "check_comparison", "compare"]
 
 
 @dataclass(frozen=True)
@@ -53,6 +55,39 @@ class Comparison:
             ),
             self.episodes.write_csv(stem.with_name(f"{stem.name}_episodes.csv")),
         ]
+
+
+def check_comparison(
+    scenes: SceneSet,
+    goals: Any,
+    *,
+    episodes_per_goal: int = 10,
+    max_steps: int = 500,
+    unreachable: Unreachable = "skip",
+    **settings: Any,
+) -> None:
+    """Refuse what :func:`compare` would refuse, before the training that comes first.
+
+    Args:
+        scenes, goals, settings: of :func:`compare`.
+
+    Raises:
+        GoalError: a goal that does not exist, or none that can be reached.
+        ConfigError: a number below 1.
+
+    >>> check_comparison(SceneSet.bundled(["bathroom"]), "all", max_steps=0)
+    Traceback (most recent call last):
+    ...
+    vusfa.errors.ConfigError: evaluation: max_steps is 0; it must be 1 or more
+    """
+    for name, value in (("episodes_per_goal", episodes_per_goal), ("max_steps", max_steps)):
+        if value < 1:
+            raise ConfigError(f"evaluation: {name} is {value}; it must be 1 or more")
+    try:
+        ids = resolve_goals(scenes, goals)
+        episode_starts(scenes, ids, 1, unreachable=unreachable, generator=torch.Generator())
+    except GoalError as error:
+        raise GoalError(f"evaluation: {error}") from error
 
 
 def compare(

@@ -12,7 +12,31 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-__all__ = ["replacing", "write_csv", "write_json"]
+from vusfa.errors import ConfigError
+
+__all__ = ["check_folder", "replacing", "write_csv", "write_json"]
+
+
+def check_folder(path: str | Path, setting: str) -> Path:
+    """Refuse, before the work, a folder that could not be written after it. Nothing is made.
+
+    Raises:
+        ConfigError: it, or what it lies in, is a file or may not be written.
+
+    >>> check_folder(__file__, "folder")  # doctest: +ELLIPSIS
+    Traceback (most recent call last):
+    ...
+    vusfa.errors.ConfigError: folder is '...files.py', but ...files.py is not a folder; give another
+    """
+    if not isinstance(path, str | os.PathLike):
+        raise ConfigError(f"{setting} is {path!r}; give the path of a folder")
+    absolute = Path(path).absolute()
+    nearest = next(place for place in (absolute, *absolute.parents) if os.path.lexists(place))
+    if not os.path.isdir(nearest):
+        raise ConfigError(f"{setting} is {str(path)!r}, but {nearest} is not a folder; give another")
+    if not os.access(nearest, os.W_OK | os.X_OK):
+        raise ConfigError(f"{setting} is {str(path)!r}, but {nearest} may not be written; give another")
+    return Path(path)
 
 
 @contextlib.contextmanager

@@ -6,7 +6,9 @@ from __future__ import annotations
 import csv
 import math
 import os
+import shutil
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Protocol
@@ -167,21 +169,33 @@ class WandbLogger:
     ) -> None:
         import wandb
 
-        Path(folder).mkdir(parents=True, exist_ok=True)
+        modes = ("online", "offline", "disabled")
+        if mode not in modes:
+            raise ConfigError(f"logger.mode is {mode!r}; it must be one of {', '.join(modes)}")
+        files = Path(folder) / "wandb"
+        missing = [place for place in (files, *files.parents) if not place.exists()]
+        Path(folder).mkdir(parents=True, exist_ok=True)  # wandb writes elsewhere where there is no folder
         # Artifacts wait in a staging folder to be sent. By default that is in HOME; keep a run's files
         # together.
         os.environ.setdefault("WANDB_DATA_DIR", str(Path(folder).resolve()))
         self._wandb = wandb
-        self.run = wandb.init(
-            dir=str(folder),
-            config=dict(config),
-            project=project,
-            mode=mode,  # type: ignore[arg-type]
-            name=name,
-            id=run_id,
-            resume="allow",
-            settings=wandb.Settings(silent=True),
-        )
+        try:
+            self.run = wandb.init(
+                dir=str(folder),
+                config=dict(config),
+                project=project,
+                mode=mode,  # type: ignore[arg-type]
+                name=name,
+                id=run_id,
+                resume="allow",
+                settings=wandb.Settings(silent=True),
+            )
+        except Exception as error:  # no key, no network, a project's name that it does not like
+            _take_back(missing)
+            reason = " ".join(str(error).split())
+            raise ConfigError(
+                f"logger wandb cannot begin ({reason}); run 'wandb login', or give logger.mode=offline"
+            ) from error
         self.run.define_metric("*", step_metric="frames")
 
     def log_metrics(self, metrics: Mapping[str, float], frames: int) -> None:
@@ -269,7 +283,7 @@ def make_loggers(
         project, mode, name: of :class:`WandbLogger`.
 
     Raises:
-        ConfigError: unknown kind, or its library is not installed.
+        ConfigError: unknown kind, its library is not installed, or wandb cannot begin.
     """
     makers: dict[str, Callable[[], Logger]] = {
         "csv": lambda: CSVLogger(folder, config, resume_frames),
@@ -280,7 +294,7 @@ def make_loggers(
         if kind not in makers:
             raise ConfigError(f"logger.kinds holds {kind!r}; it may hold {', '.join(makers)}")
     loggers = []
-    for kind in kinds:
+    for kind in sorted(kinds, key="wandb".__ne__):  # wandb first: it may refuse, and then nothing is made yet
         try:
             loggers.append(makers[kind]())
         except ImportError as error:
@@ -314,6 +328,15 @@ def _frames(row: Mapping[str, str | None]) -> int:
     """Frames of a row of ``metrics.csv``; a row that was cut off in the writing counts as later than all."""
     complete = None not in row.values()
     return int(row["frames"] or 0) if complete else 1 << 62
+
+
+def _take_back(made: Sequence[Path]) -> None:
+    """Remove folders, the innermost first, with what is in it; an outer one only if nothing else is."""
+    for place in made[:1]:
+        shutil.rmtree(place, ignore_errors=True)
+    for place in made[1:]:
+        with suppress(OSError):
+            place.rmdir()
 
 
 def _is_nan(value: Any) -> bool:

@@ -44,6 +44,8 @@ __all__ = [
 
 # entries of Agent.config that describe the scenes, not the agent
 _OF_SCENES = ("scenes", "fingerprint", "num_actions")
+# settings whose other wording changes nothing: scenes are told apart by their content
+_REWORDED = ("resume", "scenes")
 # buffers of the loss that the training moves; the others are settings
 _ADAPTED = ("bottleneck_coeff", "last_kl")
 
@@ -207,7 +209,7 @@ class Session:
 def _changes(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
     old, new = flat(before), flat(now)
     keys = [key for key in old.keys() | new.keys() if old.get(key) != new.get(key)]
-    return [f"{key}={new.get(key)} instead of {old.get(key)}" for key in sorted(keys) if key != "resume"]
+    return [f"{key}={new.get(key)} instead of {old.get(key)}" for key in sorted(keys) if key not in _REWORDED]
 
 
 def scene_sources(scenes: str | Sequence[str]) -> list[str]:
