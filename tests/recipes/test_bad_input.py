@@ -81,7 +81,6 @@ def test_an_unreachable_goal(run, tmp_path: Path):
             "env.goals=[2]",
             f"collector={kind}",
             "agent.hidden_size=8",
-            "evaluation=none",
         )
         assert "scene 'trap': no other state can reach goal 2" in text
 

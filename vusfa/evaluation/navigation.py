@@ -76,8 +76,11 @@ def episode_starts(
             starts.append(allowed[draw])
             kept.append(goal)
     if not starts:
+        first = int(torch.as_tensor(goals).flatten()[0])
+        name = scenes.names[int(scenes.scene_id[first])]
         raise GoalError(
-            f"none of the {len(goals)} goals can be reached from any state; give other goals or scenes"
+            f"none of the {len(goals)} goals can be reached from any state (scene {name!r}: no other state"
+            f" can reach goal {int(scenes.local_id(first))}); give other goals or scenes"
         )
     return torch.cat(starts), torch.tensor(kept).repeat_interleave(episodes_per_goal)
 
