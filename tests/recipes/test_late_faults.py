@@ -51,7 +51,7 @@ def run(recipe, work: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.Captu
         ("evaluation.goals=[99]", "evaluation: goal 99 is out of range"),
         ("evaluation.episodes_per_goal=0", "evaluation: episodes_per_goal is 0; it must be 1 or more"),
         ("evaluation.max_steps=0", "evaluation: max_steps is 0; it must be 1 or more"),
-        ("env.goals=[paper]", "goals: ['paper'] are no state ids; give a list of them"),
+        ("env.goals=[paper]", "goals: ['paper'] are no state ids; give integers"),
         ("env.goals=[3,true]", "goals: [3, True] are no state ids"),
         ("env.goals={hall:[a]}", "scene 'hall': ['a'] are no state ids"),
         ("env.goals={hall:3}", "scene 'hall' has 3; give a list of state ids"),

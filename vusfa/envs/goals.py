@@ -172,9 +172,7 @@ def _as_tensor(goals: Any, source: str) -> Tensor:
             raise TypeError("a truth value")
         return torch.as_tensor(goals).cpu()
     except (TypeError, ValueError, RuntimeError) as error:
-        raise GoalError(
-            f"{source}: {goals!r} are no state ids; give a list of them, like [26, 37]"
-        ) from error
+        raise GoalError(f"{source}: {goals!r} are no state ids; give integers, like [26, 37]") from error
 
 
 def _by_scene(scenes: SceneSet, goals: Mapping[str, Any], source: str) -> Tensor:
