@@ -23,23 +23,6 @@ from vusfa.objectives import USFEstimator, USFLoss
 
 TERMS = ["loss_objective", "loss_critic", "loss_entropy", "loss_successor", "loss_bottleneck"]
 DIAGNOSTICS = ["entropy", "explained_variance", "kl", "beta"]
-DEFAULT_KEYS = {
-    "advantage": "advantage",
-    "value_target": "value_target",
-    "value": "state_value",
-    "successor_features": "successor_features",
-    "successor_target": "successor_target",
-    "state_embedding": "state_embedding",
-    "state_loc": "state_loc",
-    "state_scale": "state_scale",
-    "goal_loc": "goal_loc",
-    "goal_scale": "goal_scale",
-    "action": "action",
-    "reward": "reward",
-    "done": "done",
-    "terminated": "terminated",
-    "sample_log_prob": "action_log_prob",
-}
 MODES = pytest.mark.parametrize("functional", [True, False])
 
 

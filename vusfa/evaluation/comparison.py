@@ -69,7 +69,9 @@ def check_comparison(
     """Refuse what :func:`compare` would refuse, before the training that comes first.
 
     Args:
-        scenes, goals, settings: of :func:`compare`.
+        scenes, goals: of :func:`compare`.
+        episodes_per_goal, max_steps, unreachable: of :func:`vusfa.evaluation.evaluate`.
+        settings: its others, which are not looked at.
 
     Raises:
         GoalError: a goal that does not exist, or none that can be reached.

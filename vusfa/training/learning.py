@@ -59,8 +59,7 @@ def make_loss(
     Args:
         actor, critic: of one agent.
         objective_coeff, critic_coeff, entropy_coeff, successor_coeff, bottleneck_coeff, information_target,
-        bottleneck_on,
-            information_reduction, loss_critic_type: of :class:`~vusfa.objectives.USFLoss`.
+            bottleneck_on, information_reduction, loss_critic_type: of :class:`~vusfa.objectives.USFLoss`.
         bottleneck_step_size, bottleneck_maximum: of :class:`~vusfa.objectives.DualAscent`.
         gamma, lmbda, n_steps, normalize_advantage, min_advantage_std, bootstrap_at_timeout, embedding_at: of
             :class:`~vusfa.objectives.USFEstimator`.
