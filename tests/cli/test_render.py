@@ -68,8 +68,9 @@ def test_the_renderer_gets_the_plan_and_its_progress_is_told(
     monkeypatch.setattr(room, "render_room", render)
     monkeypatch.setattr("vusfa.scenes.backbones.load_backbone", lambda name, weights: (name, weights))
     monkeypatch.setattr("vusfa.cli.progress._BRIEF", 0.0, raising=False)
-    result = run("render", "--plan", tmp_path / "bath.yaml", "-o", tmp_path / "bath.h5")
+    result = run("render", "--plan", tmp_path / "bath.yaml", "-o", tmp_path / "bath.h5", "--threads", 1)
     assert result.exit_code == 0, result.stderr
+    assert given["threads"] == 1
     assert given["plan"] == plan
     assert given["out"] == tmp_path / "bath.h5"
     assert given["backbone"] == ("efficientnet-lite0", None)

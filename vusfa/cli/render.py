@@ -61,6 +61,9 @@ def render(
         str, typer.Option(help="Network that computes the features; see `vusfa scenes encode --help`.")
     ] = "efficientnet-lite0",
     weights: Annotated[Path | None, typer.Option(help="Its weights, where they are a file of yours.")] = None,
+    threads: Annotated[
+        int | None, typer.Option(min=1, help="Threads that render; by default one for each core.")
+    ] = None,
     force: Annotated[bool, typer.Option("--force", help="Replace the file if there is one.")] = False,
 ) -> None:
     """Render a room or a flat: from its plan, or drawn and furnished from a kind and a seed.
@@ -113,6 +116,7 @@ def render(
             target,
             lambda what, done, total: reports[what](done, total),
             backbone=network,
+            threads=threads,
             say=lambda line: typer.echo(line, err=True),
         )
     typer.echo(str(made))

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import vusfa.scenes.render
-from vusfa.errors import SceneError
+from vusfa.errors import ConfigError, SceneError
 from vusfa.scenes import Scene, validate
 from vusfa.scenes.backbones import Backbone, load_backbone
 from vusfa.scenes.provenance import Provenance
@@ -146,6 +146,25 @@ def test_the_bundled_bathroom_comes_out_of_its_plan_again() -> None:
         picture = tone_map(frame, bundled.attributes["exposure"])
         # 2 to 4 levels are what JPEG takes from these pictures; another draw of the noise makes 5 of it.
         assert np.abs(picture.astype(int) - expected).mean() < 6, state
+
+
+def test_pictures_do_not_depend_on_the_threads() -> None:
+    import drjit
+
+    catalogue = Catalogue.open()
+    plan = TINY.completed(catalogue)
+    before, pictures = drjit.thread_count(), []
+    try:
+        for threads in (1, 3):
+            mi = load_mitsuba(choose_backend(), threads)
+            assert drjit.thread_count() == threads
+            renderer = Renderer(mi, build_scene(mi, plan, catalogue), plan.camera)
+            pictures.append(renderer.frame(0.3, 0.3, 90.0, 0))
+    finally:
+        drjit.set_thread_count(before)
+    np.testing.assert_array_equal(*pictures)
+    with pytest.raises(ConfigError, match="threads: 0 is too few"):
+        load_mitsuba(choose_backend(), 0)
 
 
 def test_a_bad_plan_renders_nothing(tmp_path: Path, network: Backbone) -> None:

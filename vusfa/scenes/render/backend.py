@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from functools import cache
 from typing import Any
 
-from vusfa.errors import SceneError
+from vusfa.errors import ConfigError, SceneError
 
 __all__ = ["Backend", "choose_backend", "llvm_libraries", "load_mitsuba"]
 
@@ -101,15 +101,23 @@ def choose_backend() -> Backend:
     return Backend("scalar_rgb")
 
 
-def load_mitsuba(backend: Backend) -> Any:
+def load_mitsuba(backend: Backend, threads: int | None = None) -> Any:
     """The module ``mitsuba``, set to a variant.
+
+    Args:
+        backend: the variant.
+        threads: how many threads render and denoise, in the whole process; one for each core when None.
 
     Raises:
         SceneError: Mitsuba is not installed, or lacks the variant.
+        ConfigError: ``threads`` is below 1.
     """
+    if threads is not None and threads < 1:
+        raise ConfigError(f"threads: {threads} is too few; give 1 or more")
     if backend.library is not None:
         os.environ[_VARIABLE] = backend.library
     try:
+        import drjit
         import mitsuba
         import mitsuba_oidn  # noqa: F401  found missing now rather than at the first frame
 
@@ -118,4 +126,6 @@ def load_mitsuba(backend: Backend) -> Any:
         raise SceneError(
             f"rendering needs some more packages ({error}): pip install 'vusfa[render]'"
         ) from error
+    if threads is not None:
+        drjit.set_thread_count(threads)  # the denoiser shares this pool
     return mitsuba

@@ -132,6 +132,7 @@ def render_room(
     catalogue: Catalogue | None = None,
     backbone: str | Backbone = DEFAULT,
     backend: backends.Backend | None = None,
+    threads: int | None = None,
     say: Callable[[str], None] | None = None,
 ) -> Rendered:
     """Render every pose of a plan and write the scene, atomically; called again it goes on where it was.
@@ -145,11 +146,12 @@ def render_room(
         catalogue: furniture with its files; that of this machine when left out.
         backbone: makes the features: a name for :func:`vusfa.scenes.backbones.load_backbone`, or a network.
         backend: Mitsuba's variant; the fastest that works when left out.
+        threads: how many threads render, and pictures do not depend on it; one for each core when left out.
         say: told in a line which variant is used.
 
     Raises:
         SceneError: the plan has faults, furniture or packages are missing, or the file cannot be written.
-        ConfigError: the backbone or its weights are missing.
+        ConfigError: the backbone or its weights are missing, or ``threads`` is below 1.
     """
     out = Path(out)
     if not out.parent.is_dir():
@@ -161,7 +163,7 @@ def render_room(
     raise_faults(f"plan {plan.name!r}", plan_faults(plan))  # sizes from the catalogue may not fit the room
     room = poses(plan)
     backend = backends.choose_backend() if backend is None else backend
-    mi = backends.load_mitsuba(backend)
+    mi = backends.load_mitsuba(backend, threads)
     (say or (lambda line: None))(f"{plan.name}: {room.num_states} states, rendering with {backend}")
     report = progress or (lambda what, done, total: None)
     versions = {name: metadata.version(name) for name in ("mitsuba", "mitsuba-oidn")}
