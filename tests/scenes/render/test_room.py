@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+import signal
+import threading
 from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
@@ -146,6 +149,32 @@ def test_the_bundled_bathroom_comes_out_of_its_plan_again() -> None:
         picture = tone_map(frame, bundled.attributes["exposure"])
         # 2 to 4 levels are what JPEG takes from these pictures; another draw of the noise makes 5 of it.
         assert np.abs(picture.astype(int) - expected).mean() < 6, state
+
+
+def test_ctrl_c_within_a_frame_stops_or_leaves_it_whole() -> None:
+    catalogue = Catalogue.open()
+    plan = replace(TINY.completed(catalogue), camera=replace(TINY.camera, samples=64))  # half a second
+    mi = load_mitsuba(Backend("scalar_rgb"))
+    renderer = Renderer(mi, build_scene(mi, plan, catalogue), plan.camera)
+    whole = renderer.frame(0.3, 0.3, 90.0, 0)
+    before = signal.getsignal(signal.SIGINT)
+
+    def frame_interrupted() -> np.ndarray:
+        pressed = threading.Timer(0.05, lambda: os.kill(os.getpid(), signal.SIGINT))
+        pressed.start()
+        try:
+            return renderer.frame(0.3, 0.3, 90.0, 0)
+        finally:
+            pressed.join()
+
+    try:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+        with pytest.raises(KeyboardInterrupt):
+            frame_interrupted()
+        signal.signal(signal.SIGINT, signal.SIG_IGN)  # as in a job in the background
+        np.testing.assert_array_equal(frame_interrupted(), whole)
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 def test_pictures_do_not_depend_on_the_threads() -> None:

@@ -83,6 +83,7 @@ class Renderer:
             }
         )
         self._values = mi.traverse(self._sensor)
+        self._integrator = scene.integrator()
 
     def _pose(self, x: float, z: float, heading: float) -> Any:
         origin, target = look_at(x, z, heading, self._camera)
@@ -94,8 +95,10 @@ class Renderer:
 
         self._values["to_world"] = self._pose(x, z, heading)
         self._values.update()
+        # mi.render would do the same, but turns Ctrl-C into a RuntimeError.
+        samples = self._camera.samples
         layers = np.array(
-            self._mi.render(self._scene, sensor=self._sensor, spp=self._camera.samples, seed=seed)
+            self._integrator.render(self._scene, self._sensor, seed=seed, spp=samples, evaluate=False)
         )
         colour, normal, albedo = (
             np.ascontiguousarray(layer, np.float32)
