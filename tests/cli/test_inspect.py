@@ -50,9 +50,26 @@ def test_list_draws_a_table(run: Run, scene_file: Path) -> None:
     (row,) = [line for line in result.stdout.splitlines() if "bathroom" in line]
     cells = [cell.strip() for cell in row.strip("│").split("│")]
     assert cells[:6] == ["bathroom", "176", "44", "4", "1280", "0"]
-    assert cells[6] == "0.0 %", "no steps, no success"
-    assert cells[7:] == ["8.1", "21", "200 x 150", "bundled"]
+    assert cells[6] == "0.0 %", "no look-alikes"
+    assert cells[7] == "0.0 %", "no steps, no success"
+    assert cells[8:] == ["8.1", "21", "200 x 150", "bundled"]
     assert str(scene_file) in result.stdout, "a long path is not cut off"
+
+
+def test_list_counts_the_look_alikes_of_all_scenes_of_a_name(
+    run: Run, scene_file: Path, make_scene: Any
+) -> None:
+    scene = make_scene("hall")
+    features = scene.features.clone()
+    features[1] = 2 * features[0]
+    Scene("hall", scene.graph, features).save(scene_file.with_name("two_alike.h5"))
+    arguments = ["list", scene_file, scene_file.with_name("two_alike.h5"), "bathroom"]
+    assert [row["look_alikes"] for row in json.loads(run(*arguments, "--json").stdout)] == [0, 2 / 16, 0]
+    groups = json.loads(run(*arguments, "--by-name", "--json").stdout)
+    assert groups[0] == {"name": "hall", "scenes": 2, "states": 32, "look_alikes": 0.0625, "most": 0.125}
+    (row,) = [line for line in run(*arguments, "--by-name").stdout.splitlines() if "hall" in line]
+    cells = [cell.strip() for cell in row.strip("│").split("│")]
+    assert cells == ["hall", "2", "32", "93.75 %", "87.50 %"]
 
 
 def test_list_looks_into_folders(
@@ -108,6 +125,7 @@ def test_show_draws_one_png(run: Run, scene_file: Path, monkeypatch: pytest.Monk
         assert image.format == "PNG"
     assert result.stdout.splitlines()[0] == "hall: 16 states in 4 places, islands: 0"
     assert result.stdout.splitlines()[-1] == "drawn: hall.png"
+    assert "look-alikes: 0.0 % of the states" in result.stdout
     assert "origin: not told" in result.stdout
 
 

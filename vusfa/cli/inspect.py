@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -11,8 +12,6 @@ import typer
 from vusfa.errors import SceneError
 
 if TYPE_CHECKING:
-    from rich.table import Table
-
     from vusfa.scenes import Scene
     from vusfa.scenes.summary import Summary
 
@@ -33,24 +32,30 @@ def list_scenes(
         list[str] | None,
         typer.Argument(help="Bundled names, scene files, folders of them.", metavar="SCENE|DIR..."),
     ] = None,
+    grouped: Annotated[
+        bool, typer.Option("--by-name", help="Instead, how many states look alike in all scenes of a name.")
+    ] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Write JSON instead of a table.")] = False,
     walk_steps: Annotated[int, typer.Option(min=0, help="Actions that the random walk has.")] = 500,
 ) -> None:
     """List scenes: how large they are, how far their ways, how well a random walk does.
 
     Without arguments: the bundled rooms and the scene files of the current folder. Success of the random walk
-    is exact, the mean over all goals and all starts that can reach them. Exit code 1 if a file has faults.
+    is exact, the mean over all goals and all starts that can reach them. A state looks like another where
+    their features' cosine is 0.999 or more. Exit code 1 if a file has faults.
 
     Examples:
 
         vusfa scenes list
         vusfa scenes list bathroom my_rooms/ other.h5
         vusfa scenes list --json | jq '.[].random_walk'
+        vusfa scenes list my_rooms/ --by-name
     """
     from vusfa.cli.progress import progress
+    from vusfa.cli.tables import print_wide, table_of_groups, table_of_scenes
     from vusfa.scenes import Scene, bundled_names
     from vusfa.scenes.store import bundled_path
-    from vusfa.scenes.summary import summarise
+    from vusfa.scenes.summary import by_name, summarise
 
     bundled = {name: bundled_path(name) for name in bundled_names()}
     paths = _find(sources, bundled)
@@ -63,10 +68,14 @@ def list_scenes(
                 rows.append((path, error))
             advance()
     labels = {path: "bundled" if path in bundled.values() else str(path) for path in paths}
+    groups = by_name([found for _, found in rows if not isinstance(found, SceneError)])
     if as_json:
-        typer.echo(json.dumps([_as_json(labels[path], found) for path, found in rows], indent=2))
+        plain = [_as_json(labels[path], found) for path, found in rows]
+        typer.echo(json.dumps([asdict(group) for group in groups] if grouped else plain, indent=2))
+    elif grouped:
+        print_wide(table_of_groups(groups))
     else:
-        _print_wide(_as_table([(labels[path], found) for path, found in rows], walk_steps))
+        print_wide(table_of_scenes([(labels[path], found) for path, found in rows], walk_steps))
     faulty = [found for _, found in rows if isinstance(found, SceneError)]
     for fault in faulty:
         typer.echo(f"error: {fault}", err=True)
@@ -123,49 +132,6 @@ def _as_json(label: str, found: Summary | SceneError) -> dict[str, Any]:
     return {"file": label, **found.plain()}
 
 
-def _as_table(rows: list[tuple[str, Summary | SceneError]], walk_steps: int) -> Table:
-    from rich.table import Table
-    from rich.text import Text
-
-    table = Table()
-    table.add_column("scene")
-    for column in ("states", "cells", "actions", "features", "islands"):
-        table.add_column(column, justify="right")
-    table.add_column(f"random walk,\n{walk_steps} steps", justify="right")
-    table.add_column("mean\npath", justify="right")
-    table.add_column("longest\npath", justify="right")
-    table.add_column("pictures", justify="right")
-    table.add_column("file", overflow="fold")
-    for label, found in rows:
-        if isinstance(found, SceneError):
-            table.add_row(Text("faulty", "red"), *[""] * 9, Text(label))
-            continue
-        height, width = found.picture_shape[:2] if found.picture_shape else (0, 0)
-        crops = f"{found.crops} x " if found.crops > 1 else ""
-        table.add_row(
-            Text(found.name),
-            *(str(number) for number in (found.states, found.cells, found.actions)),
-            f"{crops}{found.features}",
-            str(found.islands),
-            f"{100 * found.random_walk:.1f} %",
-            f"{found.mean_path:.1f}",
-            str(found.longest_path),
-            f"{width} x {height}" if found.picture_shape else "none",
-            Text(label),
-        )
-    return table
-
-
-def _print_wide(table: Table) -> None:
-    """In a file or a pipe a table is as wide as it needs to be."""
-    from rich.console import Console
-
-    console = Console()
-    if not console.is_terminal:
-        console = Console(width=max(console.width, console.measure(table).maximum, 200))
-    console.print(table)
-
-
 def show(
     scene: Annotated[str, typer.Argument(help="Bundled name or scene file.", show_default=False)],
     output: Annotated[
@@ -202,6 +168,7 @@ def _description(scene: Scene, summary: Summary) -> list[str]:
         f"{scene.name}: {summary.states} states in {summary.cells} places, islands: {summary.islands}",
         f"actions: {', '.join(scene.actions)}",
         f"features: {summary.features} of each crop, crops: {summary.crops}",
+        f"look-alikes: {100 * summary.look_alikes:.1f} % of the states",
         f"shortest paths: mean {summary.mean_path:.1f}, longest {summary.longest_path} actions",
         f"random walk: {100 * summary.random_walk:.1f} % success in {summary.walk_steps} actions",
     ]

@@ -4,16 +4,21 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 import torch
 
 from vusfa.scenes.graph import random_walk_success
 from vusfa.scenes.poses import places
 from vusfa.scenes.scene import Scene
 
-__all__ = ["Summary", "summarise"]
+__all__ = ["LOOK_ALIKE", "Group", "Summary", "by_name", "look_alike_share", "summarise"]
+
+#: Two states whose features' cosine is at least this look alike.
+LOOK_ALIKE = 0.999
 
 
 @dataclass(frozen=True)
@@ -25,6 +30,7 @@ class Summary:
         states, cells, actions, crops, features: how many poses, distinct places, actions, crops of each
             picture, and numbers a crop.
         islands: how many parts of the graph are cut off from the largest.
+        look_alikes: share of states that some other state looks like (:func:`look_alike_share`).
         picture_shape: (H, W, 3), or None.
         walk_steps: actions that the random walk has.
         random_walk: exact success of a random walk, the mean over all goals that can be reached; NaN without
@@ -40,6 +46,7 @@ class Summary:
     crops: int
     features: int
     islands: int
+    look_alikes: float
     picture_shape: tuple[int, int, int] | None
     walk_steps: int
     random_walk: float
@@ -60,8 +67,8 @@ def summarise(scene: Scene, walk_steps: int = 500) -> Summary:
         walk_steps: actions that the random walk has.
 
     >>> room = summarise(Scene.bundled("bathroom"))
-    >>> room.states, room.cells, room.islands, room.longest_path, round(room.random_walk, 3)
-    (176, 44, 0, 21, 0.566)
+    >>> room.states, room.cells, room.islands, room.look_alikes, room.longest_path, round(room.random_walk, 3)
+    (176, 44, 0, 0.0, 21, 0.566)
     """
     walk = random_walk_success(scene.graph, torch.arange(scene.num_states), walk_steps)
     paths = scene.distance[scene.distance > 0].double()
@@ -73,9 +80,65 @@ def summarise(scene: Scene, walk_steps: int = 500) -> Summary:
         crops=scene.num_crops,
         features=scene.feature_size,
         islands=len(scene.islands),
+        look_alikes=look_alike_share(scene.features.numpy()),
         picture_shape=scene.picture_shape,
         walk_steps=walk_steps,
         random_walk=float(walk.nanmean()),
         mean_path=float(paths.mean()),
         longest_path=int(paths.max()) if len(paths) else 0,
     )
+
+
+def look_alike_share(features: np.ndarray) -> float:
+    """Share of states whose features have a cosine of 0.999 or more with those of another state.
+
+    Args:
+        features: (N, F), or (N, C, F) with all crops side by side.
+
+    >>> look_alike_share(np.array([[1.0, 0.0], [2.0, 0.0], [0.0, 1.0], [0.5, 0.5]]))
+    0.5
+    """
+    flat = features.reshape(len(features), -1).astype(np.float64)
+    flat = flat / np.maximum(np.linalg.norm(flat, axis=1, keepdims=True), 1e-12)
+    alike = 0
+    for first in range(0, len(flat), 1024):
+        cosine = flat[first : first + 1024] @ flat.T
+        rows = np.arange(len(cosine))
+        cosine[rows, first + rows] = -1.0
+        alike += int((cosine.max(axis=1) >= LOOK_ALIKE).sum())
+    return alike / len(flat)
+
+
+@dataclass(frozen=True)
+class Group:
+    """How well the states of all scenes of one name can be told apart.
+
+    Attributes:
+        name: theirs.
+        scenes: how many there are.
+        states: of all of them.
+        look_alikes: share of these states that another of the same scene looks like.
+        most: the share in the scene that has most of them.
+    """
+
+    name: str
+    scenes: int
+    states: int
+    look_alikes: float
+    most: float
+
+
+def by_name(found: Sequence[Summary]) -> list[Group]:
+    """Scenes of the same name together, in the order in which names come first.
+
+    >>> room = summarise(Scene.bundled("bathroom"))
+    >>> by_name([room, dataclasses.replace(room, look_alikes=0.5)])
+    [Group(name='bathroom', scenes=2, states=352, look_alikes=0.25, most=0.5)]
+    """
+    groups = []
+    for name in dict.fromkeys(summary.name for summary in found):
+        mine = [summary for summary in found if summary.name == name]
+        states = sum(summary.states for summary in mine)
+        alike = sum(summary.look_alikes * summary.states for summary in mine) / states
+        groups.append(Group(name, len(mine), states, alike, max(summary.look_alikes for summary in mine)))
+    return groups

@@ -1,4 +1,4 @@
-"""Frames and pictures without a renderer: stops, brightness, look-alikes, credits, the choice of LLVM."""
+"""Frames and pictures without a renderer: stops, brightness, credits, the choice of LLVM."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from vusfa.scenes.render.backend import Backend, choose_backend, llvm_libraries
 from vusfa.scenes.render.frames import Frames
 from vusfa.scenes.render.plan import Camera, Plan
 from vusfa.scenes.render.renderer import exposure_of, look_at, tone_map
-from vusfa.scenes.render.room import credits, look_alike_share
+from vusfa.scenes.render.room import credits
 
 PLAN = Plan("a", (2.6, 2.1, 2.6), camera=Camera(resolution=(4, 3)))
 ROOM = poses(PLAN)
@@ -107,16 +107,6 @@ def test_the_camera_looks_along_its_heading_and_down(heading: float, way: tuple[
     origin, target = look_at(2.0, 3.0, heading, Camera(height=1.0, pitch=45.0))
     assert origin == [-2.0, 1.0, 3.0]
     np.testing.assert_allclose(np.subtract(target, origin), [way[0], -1.0, way[1]], atol=1e-12)
-
-
-def test_look_alikes_are_counted_by_the_nearest_other_state() -> None:
-    rng = np.random.default_rng(0)
-    features = rng.standard_normal((1500, 2, 16))
-    assert look_alike_share(features) == 0.0
-    features[1400] = 3.0 * features[7]
-    features[1401] = features[7] + 1e-4
-    features[20] = features[21] * (1 + 1e-6)
-    assert look_alike_share(features) == pytest.approx(5 / 1500)
 
 
 def test_credits_name_every_model_with_its_author_and_licence() -> None:

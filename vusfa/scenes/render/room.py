@@ -14,7 +14,6 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 
 from vusfa.errors import SceneError
 from vusfa.scenes.backbones import DEFAULT, Backbone, load_backbone
@@ -32,11 +31,9 @@ from vusfa.scenes.render.plan import Plan
 from vusfa.scenes.render.plan_file import to_yaml
 from vusfa.scenes.render.renderer import Renderer
 from vusfa.scenes.store import write
+from vusfa.scenes.summary import look_alike_share
 
-__all__ = ["LOOK_ALIKE", "Rendered", "credits", "look_alike_share", "render_room"]
-
-#: Two states whose features' cosine is at least this look alike.
-LOOK_ALIKE = 0.999
+__all__ = ["Rendered", "credits", "render_room"]
 
 #: ``progress(what, done, total)``: "frames" or "features"; first with what was done before.
 Progress = Callable[[str, int, int], None]
@@ -51,7 +48,7 @@ class Rendered:
         states: N.
         backend: what rendered it.
         seconds_per_frame: of the frames rendered now; None when all were there from before.
-        look_alikes: share of states that some other state looks like (:func:`look_alike_share`).
+        look_alikes: share of states that some other state looks like (:mod:`vusfa.scenes.summary`).
     """
 
     path: Path
@@ -66,26 +63,6 @@ class Rendered:
             f"{self.path}: {self.states} states, {self.backend}{rate}; {100 * self.look_alikes:.1f} % of them"
             f" look like another state"
         )
-
-
-def look_alike_share(features: np.ndarray) -> float:
-    """Share of states whose features have a cosine of 0.999 or more with those of another state.
-
-    Args:
-        features: (N, F), or (N, C, F) with all crops side by side.
-
-    >>> look_alike_share(np.array([[1.0, 0.0], [2.0, 0.0], [0.0, 1.0], [0.5, 0.5]]))
-    0.5
-    """
-    flat = features.reshape(len(features), -1).astype(np.float64)
-    flat = flat / np.maximum(np.linalg.norm(flat, axis=1, keepdims=True), 1e-12)
-    alike = 0
-    for first in range(0, len(flat), 1024):
-        cosine = flat[first : first + 1024] @ flat.T
-        rows = np.arange(len(cosine))
-        cosine[rows, first + rows] = -1.0
-        alike += int((cosine.max(axis=1) >= LOOK_ALIKE).sum())
-    return alike / len(flat)
 
 
 def credits(plan: Plan, catalogue: Catalogue) -> tuple[tuple[str, ...], tuple[str, ...]]:
