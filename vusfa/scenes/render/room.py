@@ -14,7 +14,6 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-
 from vusfa.errors import SceneError
 from vusfa.scenes.backbones import DEFAULT, Backbone, load_backbone
 from vusfa.scenes.encode import encode_in_steps
