@@ -183,3 +183,26 @@ def test_check_says_all_faults_of_all_files(run: Run, scene_file: Path, faulty_f
 def test_check_is_silent_about_nothing(run: Run, scene_file: Path) -> None:
     result = run("check", scene_file)
     assert (result.exit_code, result.stdout, result.stderr) == (0, f"{scene_file}: sound\n", "")
+
+
+def test_compare_says_how_far_two_scenes_are_apart(run: Run, scene_file: Path, make_scene: Any) -> None:
+    result = run("compare", scene_file, scene_file)
+    assert result.exit_code == 0, result.stderr
+    assert result.stdout.splitlines() == [
+        "graph: equal",
+        "poses: equal",
+        "pictures: 0.000 of 255 apart on average, 0.000 at most",
+        "features: equal, cosine 1.000000 on average, 1.000000 at least",
+    ]
+    scene = make_scene("hall")
+    other = scene_file.with_name("other.h5")
+    Scene("hall", scene.graph, scene.features[:, :, 1:], scene.location, scene.rotation + 1).save(other)
+    result = run("compare", scene_file, other)
+    assert result.exit_code == 1
+    assert result.stdout.splitlines() == [
+        "graph: equal",
+        "poses: different",
+        "pictures: none in one of them, or not of the same size",
+        "features: not as many",
+    ]
+    assert "176 states and cannot be compared" in run("compare", scene_file, "bathroom").stderr

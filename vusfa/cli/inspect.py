@@ -1,4 +1,4 @@
-"""``vusfa scenes list``, ``show`` and ``check``: look at scenes that are there."""
+"""``vusfa scenes list``, ``show``, ``check`` and ``compare``: look at scenes that are there."""
 
 from __future__ import annotations
 
@@ -25,6 +25,7 @@ def register(scenes: typer.Typer) -> None:
     scenes.command("list")(list_scenes)
     scenes.command("show")(show)
     scenes.command("check")(check)
+    scenes.command("compare")(compare)
 
 
 def list_scenes(
@@ -222,4 +223,37 @@ def check(
     faulty = sum(map(bool, found.values()))
     if faulty:
         typer.echo(f"error: {faulty} of {len(found)} files have faults", err=True)
+        raise typer.Exit(1)
+
+
+def compare(
+    scene: Annotated[str, typer.Argument(help="Bundled name or scene file.", show_default=False)],
+    other: Annotated[str, typer.Argument(help="Another of the same room.", show_default=False)],
+) -> None:
+    """Say whether two scenes are the same room, and how far their pictures and features are apart.
+
+    Pictures: the mean absolute difference of values 0 to 255. Features: the cosine of each state's in both.
+    Exit code 1 if an action leads elsewhere or a pose differs.
+
+    Examples:
+
+        vusfa scenes compare my_bathroom.h5 bathroom
+    """
+    from vusfa.scenes import SceneSet
+    from vusfa.scenes.compare import compare as compare_scenes
+
+    found = compare_scenes(SceneSet.open(scene).scenes[0], SceneSet.open(other).scenes[0])
+    say = {True: "equal", False: "different"}
+    typer.echo(f"graph: {say[found.graph]}")
+    typer.echo(f"poses: {say[found.poses]}")
+    if found.pixels is None:
+        typer.echo("pictures: none in one of them, or not of the same size")
+    else:
+        typer.echo(f"pictures: {found.pixels:.3f} of 255 apart on average, {found.most_pixels:.3f} at most")
+    if found.cosine is None:
+        typer.echo("features: not as many")
+    else:
+        least = f"cosine {found.cosine:.6f} on average, {found.least_cosine:.6f} at least"
+        typer.echo(f"features: {say[found.features]}, {least}")
+    if not found.same_room:
         raise typer.Exit(1)
