@@ -179,7 +179,8 @@ def test_normalised_embeddings(scenes: SceneSet) -> None:
     """Of (2, 4, 6, 8), mean 5 and deviation sqrt 5, each becomes (x - 5) / sqrt 5; whatever the scale."""
     wanted = torch.tensor([-3.0, -1.0, 1.0, 3.0]) / 5**0.5
     given = torch.tensor([2.0, 4.0, 6.0, 8.0])
-    state, goal, other = NormalisedEncoder(lambda state, goal: (state, goal, state))(given, 100 * given)
+    module = NormalisedEncoder(lambda state, goal, head: (head(state), head(goal), state))
+    state, goal, other = module(given, 100 * given)
     torch.testing.assert_close(state, wanted)
     torch.testing.assert_close(goal, wanted)
     assert other is given

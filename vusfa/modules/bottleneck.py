@@ -7,14 +7,14 @@ The encoder gives mean and scale of z for state and goal. pi and psi read the me
 from __future__ import annotations
 
 import math
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
 from vusfa.errors import ConfigError
-from vusfa.modules.siamese import SiameseEncoder
+from vusfa.modules.siamese import Head, SiameseEncoder
 
 __all__ = ["GaussianEncoder", "LatentSampler"]
 
@@ -63,16 +63,23 @@ class GaussianEncoder(nn.Module):
                 with torch.no_grad():
                     last.bias[last.out_features // 2 :] = math.log(math.expm1(initial_scale))
 
-    def forward(self, state: Tensor, goal: Tensor) -> tuple[Tensor, ...]:
-        """Embeddings of state and goal, which are the means; then mean and scale of each; all (\\*B, E)."""
-        state_code, goal_code = self.encoder(state, goal)
-        state_loc, state_scale = self._gaussian(state_code)
-        goal_loc, goal_scale = self._gaussian(goal_code)
-        return state_loc, goal_loc, state_loc, state_scale, goal_loc, goal_scale
+    def forward(self, state: Tensor, goal: Tensor, head: Head | None = None) -> tuple[Tensor, ...]:
+        """Embeddings of state and goal, which are the means, or what ``head`` makes of the means; then mean
+        and scale of each; all (\\*B, E)."""
+        of_state, of_goal = self.encoder(state, goal, _Gaussian(self.scale, head))
+        return of_state[0], of_goal[0], *of_state[1:], *of_goal[1:]
 
-    def _gaussian(self, code: Tensor) -> tuple[Tensor, Tensor]:
+
+class _Gaussian(NamedTuple):
+    """Codes to embedding, mean and scale; equal to another one if it does the same."""
+
+    scale: str
+    head: Head | None
+
+    def __call__(self, code: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         loc, scale = code.chunk(2, -1)
-        return loc, functional.softplus(scale) if self.scale == "softplus" else scale
+        embedding = loc if self.head is None else self.head(loc)
+        return embedding, loc, functional.softplus(scale) if self.scale == "softplus" else scale
 
 
 class LatentSampler(nn.Module):

@@ -49,6 +49,9 @@ class FeatureFrames(nn.Module):
             # A feature that never changes would be divided by nothing; it becomes 0 and stays out of the way.
             self.register_buffer("mean", table.mean(0))
             self.register_buffer("deviation", table.std(0, correction=0).clamp(min=1e-3))
+            # Kept as the encoder wants it, and brought up to date when other numbers are loaded.
+            self.table = (self.table - self.mean) / self.deviation
+            self._register_load_state_dict_pre_hook(self._renormalise)
 
     @property
     def num_states(self) -> int:
@@ -57,11 +60,21 @@ class FeatureFrames(nn.Module):
 
     def lookup(self, ids: Tensor | None) -> Tensor:
         """Features (\\*B, F) of states (\\*B,) int64; of all S states in order for ``None``."""
-        return self.encode(self.table if ids is None else self.table[ids])
+        return self.table if ids is None else self.table[ids]
 
     def encode(self, observation: Tensor) -> Tensor:
         """Features (\\*B, F) as the encoder wants them, of features (\\*B, F) as the scene has them."""
         return (observation - self.mean) / self.deviation if self.normalise else observation
+
+    @torch.no_grad()
+    def _renormalise(self, state: dict[str, Any], prefix: str, *_: Any) -> None:
+        """Before other means and deviations come in: the table by them."""
+        mean, deviation = (state.get(prefix + name) for name in ("mean", "deviation"))
+        if mean is None or deviation is None or mean.shape != self.mean.shape:
+            return  # load_state_dict says what is wrong
+        mean, deviation = mean.to(self.table), deviation.to(self.table)
+        if not (torch.equal(mean, self.mean) and torch.equal(deviation, self.deviation)):
+            self.table.copy_((self.table * self.deviation + self.mean - mean) / deviation)
 
 
 class PictureFrames(nn.Module):

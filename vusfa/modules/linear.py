@@ -55,6 +55,7 @@ class SceneLinear(nn.Module):
         self.out_features = out_features
         self.weight = nn.Parameter(torch.empty(num_scenes, out_features, in_features))
         self.bias = nn.Parameter(torch.empty(num_scenes, out_features))
+        self._frozen: tuple[Tensor, Tensor] | None = None
         self.reset_parameters()
 
     def reset_parameters(self) -> None:
@@ -63,38 +64,64 @@ class SceneLinear(nn.Module):
 
     def forward(self, x: Tensor, scene_id: Tensor) -> Tensor:
         """Maps (\\*B, in) with scene indices (\\*B,) int64 to (\\*B, out)."""
+        weight, bias = self._weights(x)
         if self.num_scenes == 1:
-            return functional.linear(x, self.weight.squeeze(0), self.bias.squeeze(0))
+            return functional.linear(x, weight.squeeze(0), bias.squeeze(0))
         rows, scene = x.reshape(-1, self.in_features), scene_id.reshape(-1)
         if self.num_scenes * self.out_features <= _DENSE_OUTPUTS or (
             rows.is_cuda and self.num_scenes <= _DENSE_SCENES
         ):
-            result = self._all_scenes(rows, scene)
+            result = self._all_scenes(rows, scene, weight, bias)
         else:
-            result = self._by_scene(rows, scene)
+            result = self._by_scene(rows, scene, weight, bias)
         return result.reshape(*x.shape[:-1], self.out_features)
 
-    def _all_scenes(self, rows: Tensor, scene: Tensor) -> Tensor:
-        every = functional.linear(rows, self.weight.flatten(0, 1), self.bias.flatten())
+    def _all_scenes(self, rows: Tensor, scene: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
+        every = functional.linear(rows, weight.flatten(0, 1), bias.flatten())
         every = every.view(-1, self.num_scenes, self.out_features)
         return every.gather(1, scene.view(-1, 1, 1).expand(-1, 1, self.out_features)).squeeze(1)
 
-    def _by_scene(self, rows: Tensor, scene: Tensor) -> Tensor:
+    def _by_scene(self, rows: Tensor, scene: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
         counts = torch.bincount(scene, minlength=self.num_scenes).tolist()
         # Unbound, not indexed: the gradients of the slices are then stacked once, not added up in full size.
-        weights, biases = self.weight.unbind(0), self.bias.unbind(0)
+        weights, biases = weight.unbind(0), bias.unbind(0)
         if max(counts) == len(rows):
             only = counts.index(len(rows))
             return functional.linear(rows, weights[only], biases[only])
+        if bool((scene[1:] >= scene[:-1]).all()):  # as a batch sorted by scene has it: nothing to move
+            return torch.cat(self._products(rows, counts, weights, biases))
         order = scene.argsort(stable=True)
-        parts = [
-            functional.linear(part, weights[index], biases[index])
-            for index, part in enumerate(functional.embedding(order, rows).split(counts))
-            if counts[index]
-        ]
+        parts = self._products(functional.embedding(order, rows), counts, weights, biases)
         back = torch.empty_like(order)
         back[order] = torch.arange(len(order), device=order.device)
         return functional.embedding(back, torch.cat(parts))
+
+    @staticmethod
+    def _products(
+        rows: Tensor, counts: list[int], weights: tuple[Tensor, ...], biases: tuple[Tensor, ...]
+    ) -> list[Tensor]:
+        """Of rows sorted by scene, each scene's with its weights."""
+        parts = zip(rows.split(counts), weights, biases, strict=True)
+        return [functional.linear(part, weight, bias) for part, weight, bias in parts if len(part)]
+
+    def _weights(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        if self._frozen is not None and not torch.is_grad_enabled():
+            return self._frozen
+        if not torch.is_autocast_enabled(x.device.type):
+            return self.weight, self.bias
+        # In one piece: autocast would convert each scene's slice on its own.
+        dtype = torch.get_autocast_dtype(x.device.type)
+        return self.weight.to(dtype), self.bias.to(dtype)
+
+    @torch.no_grad()
+    def freeze(self) -> None:
+        """Converts the weights for autocast now, if it is on; calls without gradients use these until
+        :meth:`thaw`."""
+        self._frozen = self._weights(self.weight)
+
+    def thaw(self) -> None:
+        """Uses the weights as they are again."""
+        self._frozen = None
 
     def extra_repr(self) -> str:
         """What ``print`` shows of the layer."""

@@ -8,13 +8,16 @@ batch once:
   (:class:`~vusfa.modules.linear.HistoryLinear`): frames are multiplied once and histories are sums of the
   results;
 - with a history of one frame all layers run on distinct states and rows are looked up at the very end;
-- goals are always encoded once each.
+- goals are always encoded once each;
+- what is made of a code alone (a Gaussian, a normalised embedding) is made of distinct codes, too: the
+  caller hands it over as a ``head``.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -22,9 +25,12 @@ from torch.nn import functional
 
 from vusfa.errors import ConfigError
 from vusfa.modules.frames import FeatureFrames, PictureFrames
-from vusfa.modules.linear import HistoryLinear
+from vusfa.modules.linear import HistoryLinear, SceneLinear
 
-__all__ = ["Branch", "NormalisedEncoder", "SiameseEncoder", "frozen"]
+__all__ = ["Branch", "Head", "NormalisedEncoder", "SiameseEncoder", "frozen"]
+
+#: What follows the encoder row by row: codes (D, out) to one or several tensors of D rows.
+Head = Callable[[Tensor], Any]
 
 
 class Branch(nn.Module):
@@ -86,17 +92,18 @@ class SiameseEncoder(nn.Module):
         self.history = history
         self.by_id = by_id
         self._frozen: tuple[Tensor, Tensor] | None = None
+        self._frozen_heads: dict[Head | None, tuple[Any, Any]] = {}
         self.frames = frames
         self.branch = Branch(history, frames.size, hidden_size, out_features)
         self.goal_branch = None if shared else Branch(history, frames.size, hidden_size, out_features)
         self.state_layer = nn.Linear(hidden_size, hidden_size) if state_layer else None
 
-    def forward(self, state: Tensor, goal: Tensor) -> tuple[Tensor, Tensor]:
-        """Codes of state and goal, (\\*B, out) each, float32."""
-        codes = self.from_ids(state, goal) if self.by_id else self.from_observations(state, goal)
-        # Under autocast the layers give half precision; embeddings are compared, summed and squared
-        # further on.
-        return codes[0].float(), codes[1].float()
+    def forward(self, state: Tensor, goal: Tensor, head: Head | None = None) -> tuple[Any, Any]:
+        """Codes of state and goal, (\\*B, out) each, float32; with a ``head``, what that makes of them."""
+        if self.by_id:
+            return self.from_ids(state, goal, head)
+        codes = self.from_observations(state, goal)
+        return _finish(codes[0], head), _finish(codes[1], head)
 
     def from_observations(self, observation: Tensor, goal_observation: Tensor) -> tuple[Tensor, Tensor]:
         """Codes of observations: every frame of every row is encoded.
@@ -125,15 +132,16 @@ class SiameseEncoder(nn.Module):
         history = frames.narrow(place, frames.size(place) - self.history, self.history)
         return branch.first(self.frames.encode(history))
 
-    def from_ids(self, state_id: Tensor, goal_id: Tensor) -> tuple[Tensor, Tensor]:
+    def from_ids(self, state_id: Tensor, goal_id: Tensor, head: Head | None = None) -> tuple[Any, Any]:
         """Codes of states by id: each distinct state of the batch is encoded once.
 
         Args:
             state_id: (\\*B, H) int64, oldest first. Of a longer history the last H frames are read.
             goal_id: (\\*B,) int64.
+            head: runs on distinct codes where they are fewer than the rows.
 
         Returns:
-            codes of state and goal, (\\*B, out) each.
+            codes of state and goal, (\\*B, out) each, float32; or what ``head`` makes of them.
 
         Raises:
             ConfigError: fewer than H frames.
@@ -141,33 +149,36 @@ class SiameseEncoder(nn.Module):
         self._check_history(state_id.shape[-1], "state_id")
         states, goals = state_id[..., -self.history :].reshape(-1, self.history), goal_id.reshape(-1)
         if self._frozen is not None and not torch.is_grad_enabled():
-            state, goal = self._from_frozen(states, goals)
+            state, goal = self._from_frozen(states, goals, head)
         else:
-            state, goal = self._from_distinct(states, goals)
-        return state.view(*goal_id.shape, -1), goal.view(*goal_id.shape, -1)
+            state, goal = self._from_distinct(states, goals, head)
+        shape = goal_id.shape
+        return _map(state, lambda rows: rows.view(*shape, -1)), _map(goal, lambda rows: rows.view(*shape, -1))
 
-    def _from_distinct(self, states: Tensor, goals: Tensor) -> tuple[Tensor, Tensor]:
+    def _from_distinct(self, states: Tensor, goals: Tensor, head: Head | None) -> tuple[Any, Any]:
         features, state_row, goal_row = self._distinct_features(states, goals)
         goal_row, goal_index = torch.unique(goal_row, return_inverse=True)
         first = self.branch.first
         if self.history == 1:
             each = first(features.unsqueeze(-2))
-            state = functional.embedding(state_row.squeeze(-1), self.branch.finish(each, self.state_layer))
+            distinct = _finish(self.branch.finish(each, self.state_layer), head)
+            state = _lookup(distinct, state_row.squeeze(-1))
             goal_first = functional.embedding(goal_row, each)
         elif len(features) <= len(states):
             projected = first.project(features)
-            state = self.branch.finish(first.gather(projected, state_row), self.state_layer)
+            code = self.branch.finish(first.gather(projected, state_row), self.state_layer)
+            state = _finish(code, head)
             goal_first = first.gather(projected, goal_row.unsqueeze(-1).expand(-1, self.history))
         else:
             # Fewer rows than distinct frames: every frame with every place's weight would be the longer way.
             histories = functional.embedding(state_row, features)
-            state = self.branch.finish(first(histories), self.state_layer)
+            state = _finish(self.branch.finish(first(histories), self.state_layer), head)
             goal_first = first.repeated(functional.embedding(goal_row, features))
         goal_branch = self.branch
         if self.goal_branch is not None:
             goal_branch = self.goal_branch
             goal_first = goal_branch.first.repeated(functional.embedding(goal_row, features))
-        return state, functional.embedding(goal_index, goal_branch.finish(goal_first))
+        return state, _lookup(_finish(goal_branch.finish(goal_first), head), goal_index)
 
     def _distinct_features(self, states: Tensor, goals: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Features (D, F) of the batch's distinct states, and each id's row in them: (R, H) and (R,).
@@ -179,15 +190,18 @@ class SiameseEncoder(nn.Module):
         distinct, row = torch.unique(torch.cat([states.flatten(), goals]), return_inverse=True)
         return self.frames.lookup(distinct), row[: states.numel()].view_as(states), row[states.numel() :]
 
-    def _from_frozen(self, states: Tensor, goals: Tensor) -> tuple[Tensor, Tensor]:
+    def _from_frozen(self, states: Tensor, goals: Tensor, head: Head | None) -> tuple[Any, Any]:
         assert self._frozen is not None
         state_part, goal_codes = self._frozen
-        if self.history == 1:
-            return functional.embedding(states.squeeze(-1), state_part), functional.embedding(
-                goals, goal_codes
-            )
-        state = self.branch.finish(self.branch.first.gather(state_part, states), self.state_layer)
-        return state, functional.embedding(goals, goal_codes)
+        one = self.history == 1
+        if head not in self._frozen_heads:
+            self._frozen_heads[head] = _finish(state_part, head) if one else None, _finish(goal_codes, head)
+        state_table, goal_table = self._frozen_heads[head]
+        goal = _lookup(goal_table, goals)
+        if one:
+            return _lookup(state_table, states.squeeze(-1)), goal
+        code = self.branch.finish(self.branch.first.gather(state_part, states), self.state_layer)
+        return _finish(code, head), goal
 
     @torch.no_grad()
     def freeze(self) -> None:
@@ -209,6 +223,7 @@ class SiameseEncoder(nn.Module):
     def thaw(self) -> None:
         """Encodes with the weights as they are again."""
         self._frozen = None
+        self._frozen_heads = {}
 
     def _check_history(self, frames: int, key: str) -> None:
         if frames < self.history:
@@ -229,10 +244,11 @@ class NormalisedEncoder(nn.Module):
     Args:
         encoder: returns the two embeddings first, (\\*B, E) each.
 
-    >>> encoder = NormalisedEncoder(lambda state, goal: (2 * state, goal - 5.0, state))
-    >>> state, goal, loc = encoder(torch.tensor([[-1.0, 1.0]]), torch.tensor([[3.0, 1.0]]))
-    >>> state.round(decimals=3), goal.round(decimals=3), loc
-    (tensor([[-1.,  1.]]), tensor([[ 1., -1.]]), tensor([[-1.,  1.]]))
+    >>> def encoder(state, goal, head):
+    ...     return head(2 * state), head(goal - 5.0)
+    >>> state, goal = NormalisedEncoder(encoder)(torch.tensor([[-1.0, 1.0]]), torch.tensor([[3.0, 1.0]]))
+    >>> state.round(decimals=3), goal.round(decimals=3)
+    (tensor([[-1.,  1.]]), tensor([[ 1., -1.]]))
     """
 
     def __init__(self, encoder: Callable[..., tuple[Tensor, ...]]) -> None:
@@ -241,21 +257,40 @@ class NormalisedEncoder(nn.Module):
 
     def forward(self, state: Tensor, goal: Tensor) -> tuple[Tensor, ...]:
         """The encoder's outputs, the first two normalised."""
-        state_embedding, goal_embedding, *rest = self.encoder(state, goal)
-        size = state_embedding.shape[-1:]
-        return (
-            functional.layer_norm(state_embedding, size),
-            functional.layer_norm(goal_embedding, size),
-            *rest,
-        )
+        return self.encoder(state, goal, _normalised)
+
+
+def _normalised(embedding: Tensor) -> Tensor:
+    return functional.layer_norm(embedding, embedding.shape[-1:])
+
+
+def _finish(code: Tensor, head: Head | None) -> Any:
+    # Under autocast the layers give half precision; embeddings are compared, summed and squared further on.
+    code = code.float()
+    return code if head is None else head(code)
+
+
+def _map(parts: Any, function: Callable[[Tensor], Tensor]) -> Any:
+    """``function`` of a tensor, or of each of several; of the same tensor once."""
+    if isinstance(parts, Tensor):
+        return function(parts)
+    done: dict[int, Tensor] = {}
+    return tuple(
+        done[id(part)] if id(part) in done else done.setdefault(id(part), function(part)) for part in parts
+    )
+
+
+def _lookup(table: Any, index: Tensor) -> Any:
+    return _map(table, lambda part: functional.embedding(index, part))
 
 
 @contextmanager
 def frozen(module: nn.Module) -> Iterator[None]:
-    """Within it, every siamese encoder in ``module`` looks up what it encoded on the way in.
+    """Within it, every siamese encoder in ``module`` looks up what it encoded on the way in, and scenes'
+    weights are converted for autocast once.
 
     The weights must not change meanwhile. Gradients are not affected: with gradients on, encoding is done
-    anew. Modules without such an encoder are left as they are, so any policy may be passed.
+    anew. Other modules are left as they are, so any policy may be passed.
 
     >>> from vusfa.modules import make_agent
     >>> from vusfa.scenes import SceneSet
@@ -263,11 +298,11 @@ def frozen(module: nn.Module) -> Iterator[None]:
     >>> with frozen(agent), torch.no_grad():
     ...     state, goal = agent.encoder(torch.zeros(3, 4, dtype=torch.int64), torch.arange(3))
     """
-    encoders = [part for part in module.modules() if isinstance(part, SiameseEncoder)]
+    parts = [part for part in module.modules() if isinstance(part, SiameseEncoder | SceneLinear)]
     try:
-        for encoder in encoders:
-            encoder.freeze()
+        for part in parts:
+            part.freeze()
         yield
     finally:
-        for encoder in encoders:
-            encoder.thaw()
+        for part in parts:
+            part.thaw()
