@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 import itertools
+import os
 import signal
 import zlib
 from collections.abc import Callable, Iterator
+from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
 import torch
 import torch.multiprocessing
 
+from vusfa.errors import SceneError
 from vusfa.scenes import Scene
+from vusfa.scenes.render.catalogue import Catalogue
 
 # A program that a shell script started in the background ignores Ctrl-C, and so do those that it starts. What
 # the tests say of interruptions shall hold there, too.
@@ -31,6 +35,35 @@ def pytest_addoption(parser: pytest.Parser) -> None:
         help="folder of numbers that the authors' released code computed, for tests/test_reference_parity.py;"
         " by default tests/golden",
     )
+
+
+def pytest_runtest_setup(item: pytest.Item) -> None:
+    """Tests marked ``render`` are skipped where a renderer is missing; under CI they fail there."""
+    if not item.get_closest_marker("render"):
+        return
+    packages = ("mitsuba", "mitsuba_oidn", "trimesh", "efficientnet_lite_pytorch")
+    missing = [name for name in packages if not find_spec(name)]
+    try:
+        Catalogue.open()
+    except SceneError:
+        missing.append("furniture (Debian's sweethome3d-furniture)")
+    if missing:
+        lacking(", ".join(missing))
+
+
+def lacking(what: str) -> None:
+    """Skip the test, or fail it under CI, where everything is to be there."""
+    give_up = pytest.fail if os.environ.get("CI") else pytest.skip
+    give_up(f"not installed: {what}")
+
+
+@pytest.fixture
+def needs_llvm() -> None:
+    """The test renders with LLVM."""
+    from vusfa.scenes.render.backend import choose_backend
+
+    if choose_backend().library is None:
+        lacking("a working LLVM (Debian's libllvm19)")
 
 
 @pytest.fixture(scope="session")

@@ -79,9 +79,8 @@ def test_the_packages_table_has_every_model_that_layouts_draw() -> None:
         Catalogue.bundled().archive(Catalogue.bundled()["Scopia#5"])
 
 
+@pytest.mark.render
 def test_the_packages_table_is_that_of_the_installed_libraries() -> None:
-    if furniture_folder() is None:
-        pytest.skip("no furniture libraries here; install Debian's sweethome3d-furniture")
     installed, table = Catalogue.open(), Catalogue.bundled()
     for name, model in table.items():
         found = installed[name]

@@ -6,7 +6,6 @@ import os
 import signal
 import threading
 from dataclasses import replace
-from importlib.util import find_spec
 from pathlib import Path
 
 import h5py
@@ -20,20 +19,11 @@ from vusfa.scenes.backbones import Backbone, load_backbone
 from vusfa.scenes.provenance import Provenance
 from vusfa.scenes.render import Catalogue, from_yaml, load_plan, poses, render_room, to_yaml
 from vusfa.scenes.render.backend import Backend, choose_backend, load_mitsuba
-from vusfa.scenes.render.catalogue import furniture_folder
 from vusfa.scenes.render.geometry import build_scene
 from vusfa.scenes.render.renderer import Renderer, tone_map
 
-MISSING = [
-    name
-    for name in ("mitsuba", "mitsuba_oidn", "trimesh", "efficientnet_lite_pytorch")
-    if not find_spec(name)
-]
-MISSING += [] if furniture_folder() else ["furniture libraries (Debian's sweethome3d-furniture)"]
-
 pytestmark = [
     pytest.mark.render,
-    pytest.mark.skipif(bool(MISSING), reason=f"not installed: {', '.join(MISSING)}"),
     # what imports do in compiled modules of others
     pytest.mark.filterwarnings("ignore::DeprecationWarning"),
 ]
@@ -121,9 +111,8 @@ def test_a_stopped_run_leaves_no_product_and_goes_on(tmp_path: Path, network: Ba
     np.testing.assert_array_equal(one.features.numpy(), other.features.numpy())
 
 
+@pytest.mark.usefixtures("needs_llvm")
 def test_the_scalar_variant_shows_the_same_room() -> None:
-    if choose_backend().library is None:
-        pytest.skip("no working LLVM here to compare with")
     catalogue = Catalogue.open()
     # With more samples there is less of the noise, in which they differ.
     plan = replace(TINY.completed(catalogue), camera=replace(TINY.camera, samples=64))
