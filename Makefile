@@ -3,6 +3,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed-dev
+RENDER := $(VENV)/.installed-render
 
 .PHONY: demo test lint typecheck clean help
 
@@ -17,6 +18,11 @@ $(STAMP): pyproject.toml constraints.txt
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[dev]'
 	touch $@
 
+# A renderer for the tests marked `render`. Furniture and LLVM are packages of the system; README.md names them.
+$(RENDER): $(STAMP)
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[dev,render]'
+	touch $@
+
 demo: $(STAMP)  ## train VUSFA in the bundled bathroom, evaluate it, film one walk
 	$(BIN)/python recipes/demo.py
 
@@ -27,7 +33,7 @@ lint: $(STAMP)  ## ruff: rules and format
 typecheck: $(STAMP)  ## mypy
 	$(BIN)/mypy
 
-test: lint typecheck  ## lint, type-check, all tests and doctests
+test: lint typecheck $(RENDER)  ## lint, type-check, all tests and doctests
 	$(BIN)/python -m pytest -n 2 -q
 
 clean:  ## remove the virtual environment and everything built
