@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 
 from vusfa.scenes.render import Rendered, layout, load_plan, room, save_plan
+from vusfa.scenes.render.backend import Backend
 
 
 def test_plan_only_writes_the_plan_that_the_seed_draws(run: Callable[..., Any], tmp_path: Path) -> None:
@@ -70,10 +71,12 @@ def test_the_renderer_gets_the_plan_and_its_progress_is_told(
     monkeypatch.setattr("vusfa.cli.progress._BRIEF", 0.0, raising=False)
     result = run("render", "--plan", tmp_path / "bath.yaml", "-o", tmp_path / "bath.h5", "--threads", 1)
     assert result.exit_code == 0, result.stderr
-    assert given["threads"] == 1
+    assert (given["threads"], given["backend"]) == (1, None)
     assert given["plan"] == plan
     assert given["out"] == tmp_path / "bath.h5"
     assert given["backbone"] == ("efficientnet-lite0", None)
     assert "rendering with chalk" in result.stderr
     assert "2 of 2 frames" in result.stderr
     assert "0.25 s a frame; 50.0 % of them look like another state" in result.stdout
+    run("render", "--plan", tmp_path / "bath.yaml", "-o", tmp_path / "bath.h5", "--scalar")
+    assert given["backend"] == Backend("scalar_rgb")

@@ -61,8 +61,12 @@ def render(
         str, typer.Option(help="Network that computes the features; see `vusfa scenes encode --help`.")
     ] = "efficientnet-lite0",
     weights: Annotated[Path | None, typer.Option(help="Its weights, where they are a file of yours.")] = None,
+    scalar: Annotated[
+        bool, typer.Option("--scalar", help="Do without LLVM also where there is one; much slower.")
+    ] = False,
     threads: Annotated[
-        int | None, typer.Option(min=1, help="Threads that render; by default one for each core.")
+        int | None,
+        typer.Option(min=1, help="Threads that render; by default one for each core, without LLVM one."),
     ] = None,
     force: Annotated[bool, typer.Option("--force", help="Replace the file if there is one.")] = False,
 ) -> None:
@@ -70,7 +74,7 @@ def render(
 
     Needs `pip install 'vusfa[render]'` and furniture: Debian's package sweethome3d-furniture, or a folder of
     Sweet Home 3D's .sh3f libraries named by SH3D_FURNITURE. With LLVM 16 or later (Debian: libllvm19) it is
-    about ten times faster. --plan-only needs none of these.
+    several times faster. --plan-only needs none of these.
 
     Stopped, it goes on where it was when the same command is given again.
 
@@ -106,6 +110,7 @@ def render(
 
     from vusfa.cli.resumed import resumed
     from vusfa.scenes.backbones import load_backbone
+    from vusfa.scenes.render.backend import Backend
     from vusfa.scenes.render.room import render_room
 
     network = load_backbone(backbone, weights=weights)
@@ -116,6 +121,7 @@ def render(
             target,
             lambda what, done, total: reports[what](done, total),
             backbone=network,
+            backend=Backend("scalar_rgb") if scalar else None,
             threads=threads,
             say=lambda line: typer.echo(line, err=True),
         )

@@ -18,7 +18,7 @@ from vusfa.scenes import Scene, validate
 from vusfa.scenes.backbones import Backbone, load_backbone
 from vusfa.scenes.provenance import Provenance
 from vusfa.scenes.render import Catalogue, from_yaml, load_plan, poses, render_room, to_yaml
-from vusfa.scenes.render.backend import Backend, choose_backend, load_mitsuba
+from vusfa.scenes.render.backend import Backend, choose_backend, cores, load_mitsuba
 from vusfa.scenes.render.geometry import build_scene
 from vusfa.scenes.render.renderer import Renderer, tone_map
 
@@ -166,23 +166,22 @@ def test_ctrl_c_within_a_frame_stops_or_leaves_it_whole() -> None:
         signal.signal(signal.SIGINT, before)
 
 
-def test_pictures_do_not_depend_on_the_threads() -> None:
+@pytest.mark.parametrize("scalar", [False, True])
+def test_pictures_do_not_depend_on_the_threads(scalar: bool) -> None:
     import drjit
 
-    catalogue = Catalogue.open()
+    catalogue, backend = Catalogue.open(), Backend("scalar_rgb") if scalar else choose_backend()
     plan = TINY.completed(catalogue)
-    before, pictures = drjit.thread_count(), []
-    try:
-        for threads in (1, 3):
-            mi = load_mitsuba(choose_backend(), threads)
-            assert drjit.thread_count() == threads
-            renderer = Renderer(mi, build_scene(mi, plan, catalogue), plan.camera)
-            pictures.append(renderer.frame(0.3, 0.3, 90.0, 0))
-    finally:
-        drjit.set_thread_count(before)
-    np.testing.assert_array_equal(*pictures)
+    pictures = []
+    for threads in (1, 3, None):
+        mi = load_mitsuba(backend, threads)
+        assert drjit.thread_count() == (threads or (1 if scalar else cores()))
+        renderer = Renderer(mi, build_scene(mi, plan, catalogue), plan.camera)
+        pictures.append(renderer.frame(0.3, 0.3, 90.0, 0))
+    np.testing.assert_array_equal(pictures[0], pictures[1])
+    np.testing.assert_array_equal(pictures[0], pictures[2])
     with pytest.raises(ConfigError, match="threads: 0 is too few"):
-        load_mitsuba(choose_backend(), 0)
+        load_mitsuba(backend, 0)
 
 
 def test_a_bad_plan_renders_nothing(tmp_path: Path, network: Backbone) -> None:

@@ -1,8 +1,8 @@
 """Which of Mitsuba's variants to render with: LLVM where one is found that works, otherwise plain C++.
 
-LLVM is about ten times faster (0.5 against 4.4 seconds of processor time a frame), but some versions of it
-crash (LLVM 15 does with Mitsuba 3.9), so each candidate first traces a small scene in a process of its own.
-``DRJIT_LIBLLVM_PATH`` names one to try first.
+LLVM is several times faster, but some versions of it crash (LLVM 15 does with Mitsuba 3.9), so each candidate
+first traces a small scene in a process of its own. ``DRJIT_LIBLLVM_PATH`` names one to try first. Threads of the
+scalar variant hinder each other: two take almost three times as long as one, so that it is given one.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from typing import Any
 
 from vusfa.errors import ConfigError, SceneError
 
-__all__ = ["Backend", "choose_backend", "llvm_libraries", "load_mitsuba"]
+__all__ = ["Backend", "choose_backend", "cores", "llvm_libraries", "load_mitsuba"]
 
 _VARIABLE = "DRJIT_LIBLLVM_PATH"
 _PATTERNS = (
@@ -51,7 +51,7 @@ class Backend:
 
     def __str__(self) -> str:
         if self.library is None:
-            return f"{self.variant} (no working LLVM found; LLVM 16 or later is about ten times faster)"
+            return f"{self.variant} (without LLVM; LLVM 16 or later is several times faster)"
         return f"{self.variant} ({self.library})"
 
 
@@ -106,7 +106,8 @@ def load_mitsuba(backend: Backend, threads: int | None = None) -> Any:
 
     Args:
         backend: the variant.
-        threads: how many threads render and denoise, in the whole process; one for each core when None.
+        threads: how many threads render and denoise, in the whole process; when None one for each core, and
+            one for the scalar variant.
 
     Raises:
         SceneError: Mitsuba is not installed, or lacks the variant.
@@ -126,6 +127,14 @@ def load_mitsuba(backend: Backend, threads: int | None = None) -> Any:
         raise SceneError(
             f"rendering needs some more packages ({error}): pip install 'vusfa[render]'"
         ) from error
-    if threads is not None:
-        drjit.set_thread_count(threads)  # the denoiser shares this pool
+    if threads is None:
+        threads = 1 if backend.library is None else cores()
+    drjit.set_thread_count(threads)  # the denoiser shares this pool
     return mitsuba
+
+
+def cores() -> int:
+    """Processor cores that this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1

@@ -122,7 +122,8 @@ def render_room(
         catalogue: furniture with its files; that of this machine when left out.
         backbone: makes the features: a name for :func:`vusfa.scenes.backbones.load_backbone`, or a network.
         backend: Mitsuba's variant; the fastest that works when left out.
-        threads: how many threads render, and pictures do not depend on it; one for each core when left out.
+        threads: how many threads render, on which pictures do not depend; when left out one for each core,
+            and one without LLVM.
         say: told in a line which variant is used.
 
     Raises:
