@@ -1,8 +1,8 @@
 """Which of Mitsuba's variants to render with: LLVM where one is found that works, otherwise plain C++.
 
 LLVM is several times faster, but some versions of it crash (LLVM 15 does with Mitsuba 3.9), so each candidate
-first traces a small scene in a process of its own. ``DRJIT_LIBLLVM_PATH`` names one to try first. Threads of the
-scalar variant hinder each other: two take almost three times as long as one, so that it is given one.
+first traces a small scene in a process of its own. ``DRJIT_LIBLLVM_PATH`` names one to try first. The scalar
+variant's threads hinder each other: two take almost three times as long as one, so that it is given one.
 """
 
 from __future__ import annotations
