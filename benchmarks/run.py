@@ -1,0 +1,82 @@
+"""Measures the library beside what a user would pick instead: python benchmarks/run.py --suite train
+
+Needs the extra ``bench``. Writes OUT/SUITE.json and prints tables; each requirement is a line, PASS or FAIL.
+The exit code is 1 when a requirement fails, except with --quick, whose numbers mean nothing.
+"""
+
+from __future__ import annotations
+
+import sys
+from enum import StrEnum
+from importlib import import_module
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+
+sys.path.insert(0, str(Path(__file__).parents[1]))  # a script's own folder is there, not the one above
+
+from benchmarks.machine import describe_machine, foreign_load
+from benchmarks.report import Options, Report, write_reports
+from benchmarks.table import print_machine, print_report
+
+
+class Suite(StrEnum):
+    """What can be measured."""
+
+    env = "env"
+    train = "train"
+    eval = "eval"
+    gpu = "gpu"
+    scaling = "scaling"
+    all = "all"
+
+
+#: The modules of each suite, in order; each has ``run(options) -> Report``.
+MODULES: dict[str, tuple[str, ...]] = {
+    "env": ("env_suite",),
+    "train": ("collect_suite", "update_suite", "solve_suite", "memory_suite"),
+    "eval": ("eval_suite",),
+    "gpu": ("gpu_suite",),
+    "scaling": ("scaling_suite",),
+}
+#: More other load than this, in cores, and the timings are doubtful.
+BUSY = 0.2
+
+
+def measure(suite: str, options: Options) -> list[Report]:
+    """Run the modules of a suite."""
+    names = [n for group in MODULES.values() for n in group] if suite == "all" else MODULES[suite]
+    return [import_module(f"benchmarks.{name}").run(options) for name in names]
+
+
+def main(
+    suite: Annotated[Suite, typer.Option(help="what to measure")] = Suite.all,
+    quick: Annotated[bool, typer.Option(help="tiny sizes, to see that everything runs")] = False,
+    out: Annotated[Path, typer.Option(help="folder of the JSON file")] = Path("runs/benchmarks"),
+    threads: Annotated[int, typer.Option(min=1, help="of torch, on two cores")] = 2,
+    repetitions: Annotated[int, typer.Option(min=1, help="turns of each workload")] = 5,
+    seconds: Annotated[float, typer.Option(min=0.0, help="of a turn")] = 1.0,
+    cap: Annotated[float, typer.Option(min=0.0, help="seconds that a training may take to solve")] = 900.0,
+) -> None:
+    """Measure, print and write down."""
+    options = Options(quick, repetitions, seconds, threads, cap)
+    if quick:
+        options = Options(quick, 1, 0.0, threads, min(cap, 5.0))
+    console, machine = Console(), describe_machine()
+    machine["foreign_load"] = round(foreign_load(), 2)
+    print_machine(machine, console)
+    if machine["foreign_load"] > BUSY:
+        console.print(f"other programs keep {machine['foreign_load']} cores busy: timings are doubtful")
+    reports = measure(suite.value, options)
+    for report in reports:
+        print_report(report, console, quick)
+    path = write_reports(out / f"{suite.value}.json", machine, options, reports)
+    console.print(f"written: {path}", soft_wrap=True)
+    failed = any(not line.passed for report in reports for line in report.requirements)
+    raise typer.Exit(1 if failed and not quick else 0)
+
+
+if __name__ == "__main__":
+    typer.run(main)
