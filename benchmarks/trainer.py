@@ -16,6 +16,7 @@ from typing import Any
 import torch
 from omegaconf import DictConfig, OmegaConf
 
+from benchmarks.report import Options
 from vusfa.envs import resolve_goals
 from vusfa.modules import make_agent
 from vusfa.scenes import SceneSet
@@ -34,7 +35,7 @@ from vusfa.training import (
 )
 from vusfa.training.launch import compose
 
-__all__ = ["CONF", "Trainer", "make_trainer", "recipe_settings"]
+__all__ = ["CONF", "Trainer", "make_trainer", "recipe_settings", "small"]
 
 CONF = Path(__file__).parents[1] / "recipes" / "conf"
 
@@ -137,3 +138,11 @@ def make_trainer(overrides: Sequence[str] = (), scenes: SceneSet | None = None) 
     >>> trainer.close()
     """
     return Trainer(recipe_settings(overrides), scenes)
+
+
+def small(options: Options) -> list[str]:
+    """Overrides that make a training tiny, for ``--quick``; none otherwise."""
+    if not options.quick:
+        return []
+    sizes = ["agent.hidden_size=16", "agent.embedding_size=16"]
+    return ["scenes=[bathroom]", *sizes, "collector.num_envs=8", "collector.rollout=4"]
