@@ -137,14 +137,17 @@ def read_reports(path: Path) -> list[Report]:
                 )
                 for row in suite["rows"]
             ],
-            [
-                Requirement(**{k: nan if v is None else v for k, v in line.items() if k != "passed"})
-                for line in suite["requirements"]
-            ],
+            [_requirement(line) for line in suite["requirements"]],
             suite["skipped"],
         )
         for suite in suites
     ]
+
+
+def _requirement(line: dict[str, Any]) -> Requirement:
+    fields = {key: value for key, value in line.items() if key != "passed"}
+    fields["value"] = math.nan if line["value"] is None else line["value"]
+    return Requirement(**fields)
 
 
 def _plain(report: Report) -> dict[str, Any]:

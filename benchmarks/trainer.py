@@ -60,6 +60,8 @@ class Trainer:
 
     Attributes:
         session: the recipe's, with agent, loss, optimiser, frames and meters.
+        batches: the collector's.
+        estimator: of the targets.
     """
 
     def __init__(self, cfg: DictConfig, scenes: SceneSet | None = None) -> None:
@@ -73,7 +75,7 @@ class Trainer:
         given = {key: value for key, value in plain["agent"].items() if value is not None}
         agent = make_agent(scenes=scenes, **given).to(device)
         actor, critic = agent.get_policy_operator(), agent.get_value_operator()
-        loss, self._estimator, self._multiplier = make_loss(
+        loss, self.estimator, self._multiplier = make_loss(
             actor, critic, entropy_coeff=plain["entropy"]["start"], **plain["objective"]
         )
         optim = plain["optim"]
@@ -96,7 +98,7 @@ class Trainer:
         )
         self.actor = actor
         self._open = ExitStack()
-        self._batches = self._open.enter_context(self.session.collecting(collector))
+        self.batches = self._open.enter_context(self.session.collecting(collector))
 
     @property
     def agent(self) -> torch.nn.Module:
@@ -106,7 +108,7 @@ class Trainer:
     def collect(self) -> int:
         """Collect one batch and throw it away; the frames it has."""
         with self._half():
-            return next(self._batches).numel()
+            return next(self.batches).numel()
 
     def update(self) -> int:
         """Collect, compute returns and loss, step the optimiser; the frames that it took."""
@@ -115,7 +117,7 @@ class Trainer:
         lr = annealed(before, optim["lr"], optim["horizon"])
         session.loss.entropy_coeff = annealed(before, **self._plain["entropy"])
         with self._half():
-            batch = self._estimator(next(self._batches))
+            batch = self.estimator(next(self.batches))
         with self._half():
             terms = session.loss(batch)
         norm = descend(session.optimiser, total_loss(session.loss, terms), lr, optim["max_grad_norm"])

@@ -202,11 +202,9 @@ class BareTraining:
         following = torch.cat([value[envs:], value.new_zeros(envs)])
         following[place] = end_value
         cumulant, bootstrap = batch.reward.unsqueeze(-1), following.view(time, envs, 1)
-        if out.successor is not None:
-            psi, phi = (
-                _following(x, back, envs, place, y)
-                for x, y in ((out.successor, end.successor), (out.embedding, end.embedding))
-            )
+        if out.successor is not None and end.successor is not None:
+            psi = _following(out.successor, back, envs, place, end.successor)
+            phi = _following(out.embedding, back, envs, place, end.embedding)
             cumulant = torch.cat([cumulant, phi.view(time, envs, -1)], -1)
             bootstrap = torch.cat([bootstrap, psi.view(time, envs, -1)], -1)
         returns = self._returns(cumulant, bootstrap, batch).flatten(0, 1)

@@ -54,7 +54,7 @@ class SceneVecEnv(VecEnv):
         )
         super().__init__(num_envs, space, self._envs.single_action_space)
 
-    def reset(self) -> dict[str, np.ndarray]:  # type: ignore[override]
+    def reset(self) -> dict[str, np.ndarray]:
         """Begin episodes everywhere."""
         ids, _ = self._envs.reset(seed=self._seed)
         self._seed = None

@@ -1,0 +1,95 @@
+"""Memory: bytes a frame, the most that a training holds, and whether it grows."""
+
+from __future__ import annotations
+
+import gc
+import multiprocessing
+import resource
+from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor
+from pathlib import Path
+
+import psutil
+import torch
+
+from benchmarks.report import Options, Report, Requirement, Row
+from benchmarks.trainer import make_trainer, small
+
+__all__ = ["bytes_a_frame", "growth", "peak", "peak_so_far", "run"]
+
+#: Growth over the updates, MiB: the allocator's slack.
+SLACK = 8.0
+
+
+def run(options: Options) -> Report:
+    """Each measurement in a process of its own."""
+    report = Report("memory")
+    tiny = small(options)
+    kinds = {
+        "ids": ["agent.model=vusfa", *tiny],
+        "features": ["agent.model=vusfa", "agent.observation=features", *tiny],
+    }
+    for place, more in (("collector", []), ("worker pipes", ["collector=multi_sync"])):
+        size = {kind: _apart(bytes_a_frame, [*given, *more]) for kind, given in kinds.items()}
+        times = size["features"] / size["ids"]
+        report.rows.append(Row(f"{place}: a frame as ids", size["ids"], "bytes", "features", times))
+        report.rows.append(Row(f"{place}: a frame as features", size["features"], "bytes"))
+    most = {kind: _apart(peak, given, 1 if options.quick else 5) for kind, given in kinds.items()}
+    times = most["features"] / most["ids"]
+    report.rows.append(Row("peak resident memory of a training", most["ids"], "MiB", "features", times))
+    report.rows.append(Row("peak resident memory, features", most["features"], "MiB"))
+    updates = 20 if options.quick else 10_000
+    grown = _apart(growth, small(Options(quick=True)), updates)
+    report.rows.append(Row(f"growth over {updates:,} updates", grown, "MiB", note="of a tiny network"))
+    if not options.quick:
+        what = f"growth of resident memory over {updates:,} updates"
+        report.requirements.append(Requirement(what, grown, SLACK, "MiB", at_least=False))
+    return report
+
+
+def bytes_a_frame(overrides: Sequence[str]) -> float:
+    """Bytes of a collected batch, a frame."""
+    trainer = make_trainer(overrides)
+    batch = next(trainer.batches)
+    trainer.close()
+    return batch.bytes() / batch.numel()
+
+
+def peak(overrides: Sequence[str], updates: int) -> float:
+    """The most memory that this process has held after so many updates, MiB."""
+    trainer = make_trainer(overrides)
+    for _ in range(updates):
+        trainer.update()
+    trainer.close()
+    return peak_so_far()
+
+
+def peak_so_far() -> float:
+    """The most memory that this process has held, MiB."""
+    status = Path("/proc/self/status")
+    if status.exists():  # of this program alone; what getrusage tells may be the parent's
+        line = next(line for line in status.read_text().splitlines() if line.startswith("VmHWM"))
+        return int(line.split()[1]) / 1024
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+
+
+def growth(overrides: Sequence[str], updates: int) -> float:
+    """Resident memory after so many updates less that after a tenth of them, MiB."""
+    torch.set_num_threads(1)
+    trainer = make_trainer(overrides)
+    own, before = psutil.Process(), 0
+    for index in range(updates + updates // 10):
+        if index == updates // 10:
+            gc.collect()
+            before = own.memory_info().rss
+        trainer.update()
+    gc.collect()
+    after = own.memory_info().rss
+    trainer.close()
+    return (after - before) / 2**20
+
+
+def _apart(function: object, *arguments: object) -> float:
+    """The function's result, computed in a process of its own."""
+    with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as pool:
+        return pool.submit(function, *arguments).result()  # type: ignore[arg-type]

@@ -1,0 +1,57 @@
+"""How speed and memory change with the number of rooms, of environments and of workers."""
+
+from __future__ import annotations
+
+import multiprocessing
+import time
+from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor
+
+import torch
+
+from benchmarks.memory_suite import peak_so_far
+from benchmarks.report import Options, Report, Row
+from benchmarks.trainer import make_trainer, small
+from benchmarks.worlds import tiled
+
+__all__ = ["measure", "run"]
+
+ROOMS, ENVS = (4, 40, 400), (64, 1024, 4096)
+
+
+def run(options: Options) -> Report:
+    """Complete VUSFA updates, one process for each point of the grid."""
+    report = Report("scaling")
+    rooms_, envs_ = ((2,), (8,)) if options.quick else (ROOMS, ENVS)
+    points = [(rooms, envs, 1) for rooms in rooms_ for envs in envs_]
+    points += [(rooms, envs_[len(envs_) // 2], 2) for rooms in rooms_]
+    for rooms, envs, workers in points:
+        overrides = [*small(options), f"collector.num_envs={envs}"]
+        if workers > 1:
+            overrides += ["collector=multi_sync", f"collector.num_workers={workers}"]
+        with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as pool:
+            call = pool.submit(measure, rooms, overrides, options.seconds, options.threads)
+            states, speed, memory = call.result()
+        label = (
+            f"{rooms} rooms ({states:,} states), {envs} environments, {workers} worker{'s' * (workers > 1)}"
+        )
+        first = report.rows[0].value if report.rows else speed
+        peer = report.rows[0].name if report.rows else ""
+        report.rows.append(Row(label, speed, "frames/s", peer, speed / first if peer else None))
+        report.rows.append(Row(f"{label}, peak memory", memory, "MiB"))
+    return report
+
+
+def measure(rooms: int, overrides: Sequence[str], seconds: float, threads: int) -> tuple[int, float, float]:
+    """States of the world, frames a second of complete updates, and the main process's peak memory in MiB."""
+    torch.set_num_threads(threads)
+    scenes = tiled(rooms)
+    trainer = make_trainer(overrides, scenes)
+    trainer.update()
+    torch.set_num_threads(threads)
+    began, frames = time.perf_counter(), 0
+    while not frames or time.perf_counter() - began < seconds:
+        frames += trainer.update()
+    speed = frames / (time.perf_counter() - began)
+    trainer.close()
+    return scenes.num_states, speed, peak_so_far()

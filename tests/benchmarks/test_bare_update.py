@@ -1,0 +1,76 @@
+"""The bare update computes what the library computes: targets, loss and gradients of the same batch."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from benchmarks.peers.bare_update import BareTraining, Batch, Noise
+from benchmarks.trainer import make_trainer
+from vusfa.training import total_loss
+
+
+def _as_bare(batch, bare: BareTraining) -> Batch:
+    after = batch["next"]
+    return Batch(
+        batch["state_id"].transpose(0, 1),
+        bare.slot[batch["goal_id"].T],
+        batch["scene_id"].T,
+        batch["action"].T,
+        after["state_id"].transpose(0, 1),
+        after["reward"].squeeze(-1).T,
+        after["terminated"].squeeze(-1).T,
+        after["done"].squeeze(-1).T,
+    )
+
+
+@pytest.mark.parametrize("history", [1, 4])
+@pytest.mark.parametrize("model", ["gvf", "usfa", "sfdp", "vusfa"])
+def test_loss_and_gradients_are_those_of_the_library(model: str, history: int, tiny):
+    threads = torch.get_num_threads()
+    overrides = [f"agent.model={model}", f"agent.history={history}", "collector.rollout=12"]
+    trainer = make_trainer(tiny(*overrides, "collector.num_envs=16", "objective.lmbda=0.9"))
+    bare, session = BareTraining(trainer), trainer.session
+    session.loss.entropy_coeff = trainer.cfg.entropy.start
+    if model == "vusfa":
+        session.loss.bottleneck_coeff = 0.3
+        bare.beta = torch.tensor(0.3)
+        session.agent.latent.noise = torch.zeros_like  # the draws come in another order
+    batch = next(trainer.batches).clone()
+    assert batch["next", "done"].any()
+    loss = session.loss
+    expected = total_loss(loss, loss(trainer.estimator(batch)))
+    expected.backward()
+    plain = _as_bare(batch, bare)
+    net = bare.net
+    w = net.weights()
+    zeros = torch.zeros(192, 8)
+    ends = int(plain.done[:-1].sum()) + 16
+    noise = Noise(zeros, zeros[:1].expand(ends, 8), zeros) if model == "vusfa" else Noise(None, None, None)
+    found, _ = bare.loss(w, net.states(w), net.goals(w, bare.goal_ids), plain, noise)
+    found.backward()
+    trainer.close()
+    torch.set_num_threads(threads)
+    torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-6)
+    for (name, theirs), ours in zip(net.params.items(), session.agent.parameters(), strict=True):
+        scale = float(ours.grad.abs().max())
+        torch.testing.assert_close(theirs.grad, ours.grad, rtol=1e-3, atol=1e-4 * scale + 1e-9, msg=name)
+
+
+def test_updates_move_every_weight_and_the_multiplier(tiny):
+    trainer = make_trainer(tiny("agent.model=vusfa"))
+    bare = BareTraining(trainer)
+    before = [param.detach().clone() for param in bare.params]
+    assert [bare.update() for _ in range(4)] == [24] * 4
+    assert bare.frames == 96
+    assert bare.beta > 0
+    for old, new in zip(before, bare.params, strict=True):
+        assert not torch.equal(old, new)
+    trainer.close()
+
+
+def test_what_it_does_not_know_is_refused(tiny):
+    trainer = make_trainer(tiny("optim=rmsprop"))
+    with pytest.raises(ValueError, match="adam"):
+        BareTraining(trainer)
+    trainer.close()
