@@ -71,8 +71,8 @@ def train(cfg: DictConfig, overrides: list[str]) -> tuple[Session, Comparison | 
     if cfg.evaluation.goals:
         check_comparison(scenes, wanted, **measured)
     agent = make_agent(scenes=scenes, **{k: v for k, v in plain["agent"].items() if v is not None}).to(device)
-    actor, critic = agent.get_policy_operator(), agent.get_value_operator()
-    loss, estimator, multiplier = make_loss(
+    actor, critic = agent.get_policy_operator(out_keys=["action"]), agent.get_value_operator()
+    loss, _, multiplier = make_loss(
         actor, critic, entropy_coeff=plain["entropy"]["start"], **plain["objective"]
     )
     optimiser = make_optimiser(
@@ -104,10 +104,11 @@ def train(cfg: DictConfig, overrides: list[str]) -> tuple[Session, Comparison | 
                 began, before = time.monotonic(), session.frames
                 lr = annealed(before, optim["lr"], optim["horizon"])
                 loss.entropy_coeff = annealed(before, **plain["entropy"])
-                with half():
-                    batch = estimator(next(batches))
-                with half():  # a block of its own: autocast keeps weights that it converted without gradients
-                    terms = loss(batch)
+                with session.encoded_once(half):
+                    with half():
+                        batch = next(batches)
+                    with half():  # another one: autocast keeps weights that it converted without gradients
+                        terms = loss(batch)
                 norm = descend(optimiser, total_loss(loss, terms), lr, optim["max_grad_norm"])
                 if multiplier is not None:
                     multiplier.step()

@@ -28,7 +28,7 @@ WRITTEN = {
     "gvf": TRUNK,
     "usfa": {**TRUNK, **SUCCESSOR},
     "sfdp": {**TRUNK, **SUCCESSOR},
-    "vusfa": {**TRUNK, **SUCCESSOR, **GAUSSIAN},
+    "vusfa": {**TRUNK, **SUCCESSOR, **GAUSSIAN, "state_kl": 1, "goal_kl": 1},
 }
 
 
@@ -102,7 +102,7 @@ class TestOperators:
         shared = [module for module in actor if any(module is other for other in critic)]
         names = [type(module.module).__name__ for module in shared]
         psi = ["SuccessorHead"] if model in ("sfdp", "vusfa") else []
-        assert names == ["NormalisedEncoder", "Fusion", "SceneLayer", *psi]
+        assert names == ["SiameseTrunk", "SceneLayer", *psi]
         assert all(a is b for a, b in zip(actor[:-1], agent.get_policy_operator().module[:-1], strict=True))
 
     @pytest.mark.parametrize(("model", "computed"), [("usfa", False), ("sfdp", True), ("vusfa", True)])

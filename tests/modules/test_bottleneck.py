@@ -17,10 +17,13 @@ class TestGaussianEncoder:
     def test_means_are_the_embeddings(self, scenes: SceneSet) -> None:
         module = gaussian(scenes)
         inputs = torch.randint(21, (3, 4)), torch.randint(21, (3,))
-        state, goal, state_loc, state_scale, goal_loc, goal_scale = module(*inputs)
+        state, goal, state_loc, state_scale, state_kl, goal_loc, goal_scale, goal_kl = module(*inputs)
         state_code, goal_code = module.encoder(*inputs)
-        assert state is state_loc
-        assert goal is goal_loc
+        assert torch.equal(state, state_loc)
+        assert torch.equal(goal, goal_loc)
+        for kl, loc, scale in ((state_kl, state_loc, state_scale), (goal_kl, goal_loc, goal_scale)):
+            nats = 0.5 * (loc**2 + scale**2 - 1) - scale.abs().log()
+            torch.testing.assert_close(kl, nats.sum(-1, keepdim=True))
         assert torch.equal(state_loc, state_code[:, :8])
         assert torch.equal(goal_loc, goal_code[:, :8])
         torch.testing.assert_close(state_scale, (1 + state_code[:, 8:].exp()).log())

@@ -179,11 +179,14 @@ def test_normalised_embeddings(scenes: SceneSet) -> None:
     """Of (2, 4, 6, 8), mean 5 and deviation sqrt 5, each becomes (x - 5) / sqrt 5; whatever the scale."""
     wanted = torch.tensor([-3.0, -1.0, 1.0, 3.0]) / 5**0.5
     given = torch.tensor([2.0, 4.0, 6.0, 8.0])
-    module = NormalisedEncoder(lambda state, goal, head: (head(state), head(goal), state))
-    state, goal, other = module(given, 100 * given)
+
+    class Encoder:
+        def both(self, state: torch.Tensor, goal: torch.Tensor, heads: Any) -> tuple[Any, Any]:
+            return heads[0](state), heads[1](goal)
+
+    state, goal = NormalisedEncoder(Encoder())(given, 100 * given)
     torch.testing.assert_close(state, wanted)
     torch.testing.assert_close(goal, wanted)
-    assert other is given
 
 
 class TestFrozen:
@@ -218,6 +221,24 @@ class TestFrozen:
         with frozen(module):
             module(*ids(scenes, 5))[0].sum().backward()
         assert all(parameter.grad.any() for parameter in module.parameters())
+
+    @pytest.mark.parametrize("history", [1, 4])
+    def test_gradients_through_what_is_looked_up(self, scenes: SceneSet, history: int) -> None:
+        """Encoded once with gradients, collected with and differentiated: the gradients of encoding anew."""
+        module, inputs = encoder(scenes, history), ids(scenes, 2, 5, history=history)
+        gradients = []
+        for grad in (False, True):
+            module.zero_grad()
+            with frozen(module, grad=grad):
+                with torch.no_grad():
+                    module(*inputs)
+                with FlopCounterMode(display=False) as counter:
+                    state, goal = module(*inputs)
+                (state.square().sum() + goal.sum()).backward()
+            gradients.append([parameter.grad.clone() for parameter in module.parameters()])
+        torch.testing.assert_close(gradients[0], gradients[1], atol=1e-4, rtol=1e-4)
+        if history == 1:
+            assert counter.get_total_flops() == 0
 
     def test_an_agent_fed_features_has_nothing_to_freeze(self, scenes: SceneSet) -> None:
         module = SiameseEncoder(FeatureFrames(scenes.features, lookup=False), 4, 16, 8, by_id=False)

@@ -229,6 +229,20 @@ class TestOneEvaluation:
         assert inside > 0
         assert sizes == [4 * 6 + 4 + inside]
 
+    @pytest.mark.parametrize("time_dim", [0, 1])
+    def test_what_the_critic_wrote_at_the_roots_may_be_known(self, time_dim: int) -> None:
+        """The same targets; the critic sees only the states that are no root."""
+        td = table_rollout(4, 6, seed=3, ends=0.3)
+        critic, sizes = table_critic(), []
+        wanted, written = USFEstimator(value_network=critic)(td.copy()), critic(td.copy())
+        critic.register_forward_hook(lambda module, args, out: sizes.append(args[0].numel()))
+        if time_dim == 0:
+            td, written = td.transpose(0, 1), written.transpose(0, 1)
+        got = USFEstimator(value_network=critic)(td.copy(), written=written, time_dim=time_dim)
+        for key in ("advantage", "value_target", "successor_target"):
+            torch.testing.assert_close(got[key], wanted[key] if time_dim else wanted[key].transpose(0, 1))
+        assert sizes == [4 + td["next", "done"].sum().item() - wanted["next", "done"][:, -1].sum().item()]
+
     def test_it_runs_on_the_parameters_given(self, plain, rollout) -> None:
         critic = plain().critic
         td = rollout(2, 4)

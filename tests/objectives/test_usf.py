@@ -16,6 +16,7 @@ from tensordict.nn import (
     set_composite_lp_aggregate,
 )
 from tensordict.nn import TensorDictModule as Mod
+from tensordict.nn import TensorDictSequential as Seq
 from torch import nn
 from torchrl.modules import ProbabilisticActor, TanhNormal
 
@@ -345,3 +346,43 @@ class TestOtherActions:
         td["action"].requires_grad_()
         with pytest.raises(RuntimeError, match="tensordict stored action requires grad"):
             USFLoss(*networks)(td)
+
+
+class TestKnownDivergence:
+    @pytest.mark.parametrize("reduction", ["mean", "sum"])
+    def test_what_the_critic_writes_is_taken(self, usf, rollout, reduction: str) -> None:
+        """A critic that writes the divergences itself: the same term, and no mean or scale is looked at."""
+        networks, td = usf(), rollout(2, 4)
+
+        def divergence(loc: torch.Tensor, scale: torch.Tensor) -> torch.Tensor:
+            nats = 0.5 * (loc**2 + scale**2 - (scale**2 + 1e-8).log() - 1)
+            return nats.sum(-1, keepdim=True)
+
+        extra = [
+            Mod(divergence, in_keys=[f"{name}_loc", f"{name}_scale"], out_keys=[f"{name}_kl"])
+            for name in ("state", "goal")
+        ]
+        options = {"bottleneck_coeff": 0.5, "information_reduction": reduction}
+        plain = USFLoss(networks.actor, networks.critic, **options)(td)
+        known = USFLoss(networks.actor, Seq(networks.critic, *extra), **options)(td)
+        torch.testing.assert_close(known["kl"], plain["kl"])
+        torch.testing.assert_close(known["loss_bottleneck"], plain["loss_bottleneck"])
+        extra[0].module = lambda loc, scale: torch.full((*loc.shape[:-1], 1), 7.0)
+        other = USFLoss(networks.actor, Seq(networks.critic, *extra), **options)(td)
+        assert (other["kl"] - plain["kl"]).abs() > 0.1
+
+
+class TestOnePass:
+    def test_targets_come_from_the_losss_own_pass(self, usf, rollout) -> None:
+        """With no noise in the critic: the terms of targets computed first, and fewer states evaluated."""
+        networks, td = usf(variational=False), rollout(3, 5)
+        loss = USFLoss(networks.actor, networks.critic)
+        loss.make_value_estimator(gamma=0.9)
+        sizes: list[int] = []
+        loss.critic_network.register_forward_hook(lambda module, args, out: sizes.append(args[0].numel()))
+        first = loss(loss.value_estimator(td.copy(), params=loss.critic_network_params))
+        once = loss(td)
+        ends = 3 + int(td["next", "done"][:, :-1].sum())
+        assert sizes == [15 + ends, 15, 15, ends]
+        for key in first.keys():
+            torch.testing.assert_close(once[key], first[key])

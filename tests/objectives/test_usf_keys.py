@@ -28,6 +28,8 @@ DEFAULT_KEYS = {
     "state_scale": "state_scale",
     "goal_loc": "goal_loc",
     "goal_scale": "goal_scale",
+    "state_kl": "state_kl",
+    "goal_kl": "goal_kl",
     "action": "action",
     "reward": "reward",
     "done": "done",

@@ -34,7 +34,7 @@ from vusfa.modules.policy import PolicyHead, SuccessorPolicyHead
 from vusfa.modules.presets import AgentConfig, resolve_config
 from vusfa.modules.siamese import NormalisedEncoder, SiameseEncoder
 from vusfa.modules.successor import RewardHead, SuccessorHead, SuccessorValue, ValueHead
-from vusfa.modules.trunk import Fusion, SceneLayer
+from vusfa.modules.trunk import Fusion, SceneLayer, SiameseTrunk
 
 __all__ = ["Agent", "make_agent"]
 
@@ -77,6 +77,8 @@ class Agent(nn.Module):
     |---|---|---|
     | ``state_embedding``, ``goal_embedding`` | (\\*B, E) | encoder; with a bottleneck the means |
     | ``state_loc``, ``state_scale``, ``goal_loc``, ``goal_scale`` | (\\*B, E) | encoder with a bottleneck |
+    | ``state_kl``, ``goal_kl`` | (\\*B, 1) | the same: divergence from N(0, 1), summed over E, in nats |
+    | ``fused`` | (\\*B, hidden_size) | encoder and fusion |
     | ``goal_latent`` | (\\*B, E) | bottleneck: z_g |
     | ``hidden`` | (\\*B, hidden_size) | scene layer |
     | ``successor_features``, ``reward_weights`` | (\\*B, E) | psi, omega |
@@ -129,12 +131,10 @@ class Agent(nn.Module):
         by_id = config.observation == "index"
         read = ["state_id", "goal_id"] if by_id else ["observation", "goal_observation"]
         embeddings = ["state_embedding", "goal_embedding"]
-        gaussian = ["state_loc", "state_scale", "goal_loc", "goal_scale"]
+        gaussian = ["state_loc", "state_scale", "state_kl", "goal_loc", "goal_scale", "goal_kl"]
         steps: dict[str, TensorDictModuleBase] = {}
-        steps["encoder"] = TensorDictModule(
-            self.encoder, read, embeddings + (gaussian if self.latent else [])
-        )
-        steps["fusion"] = TensorDictModule(self.fusion, embeddings, ["fused"])
+        written = [*embeddings, *(gaussian if self.latent else []), "fused"]
+        steps["trunk"] = TensorDictModule(SiameseTrunk(self.encoder, self.fusion), read, written)
         if self.memory is not None:
             steps["memory"] = LSTMModule(lstm=self.memory, in_key="fused", out_key="remembered")
         fused = "fused" if self.memory is None else "remembered"
@@ -157,9 +157,7 @@ class Agent(nn.Module):
 
     def _trunk(self) -> list[TensorDictModuleBase]:
         operators = self.__dict__["_operators"]
-        return [
-            operators[name] for name in ("encoder", "fusion", "memory", "scene_layer") if name in operators
-        ]
+        return [operators[name] for name in ("trunk", "memory", "scene_layer") if name in operators]
 
     def get_policy_operator(
         self, out_keys: Sequence[NestedKey] = ("action", "action_log_prob")
@@ -179,7 +177,7 @@ class Agent(nn.Module):
             distribution_class=Categorical,
             distribution_kwargs={"validate_args": False},
             default_interaction_type=InteractionType.RANDOM,
-            return_log_prob=True,
+            return_log_prob="action_log_prob" in out_keys,
             log_prob_key="action_log_prob",
         )
         recurrent = [key for key in operators["memory"].out_keys[1:]] if self.memory is not None else []

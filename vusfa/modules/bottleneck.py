@@ -7,14 +7,15 @@ The encoder gives mean and scale of z for state and goal. pi and psi read the me
 from __future__ import annotations
 
 import math
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
 from vusfa.errors import ConfigError
-from vusfa.modules.siamese import Head, SiameseEncoder
+from vusfa.modules.siamese import Head, Heads, SiameseEncoder, as_it_is, interleaved
+from vusfa.objectives.functional import gaussian_kl
 
 __all__ = ["GaussianEncoder", "LatentSampler"]
 
@@ -35,9 +36,9 @@ class GaussianEncoder(nn.Module):
     >>> from vusfa.modules.frames import FeatureFrames
     >>> encoder = SiameseEncoder(FeatureFrames(torch.rand(12, 1, 8)), 4, 16, 2 * 6)
     >>> gaussian, state_id = GaussianEncoder(encoder, initial_scale=0.1), torch.zeros(3, 4, dtype=torch.int64)
-    >>> *embeddings, state_loc, state_scale, goal_loc, goal_scale = gaussian(state_id, torch.arange(3))
-    >>> goal_scale.shape, bool((goal_scale > 0).all())
-    (torch.Size([3, 6]), True)
+    >>> *of_state, goal_loc, goal_scale, goal_kl = gaussian(state_id, torch.arange(3))
+    >>> goal_scale.shape, bool((goal_scale > 0).all()), goal_kl.shape
+    (torch.Size([3, 6]), True, torch.Size([3, 1]))
     """
 
     def __init__(
@@ -63,23 +64,32 @@ class GaussianEncoder(nn.Module):
                 with torch.no_grad():
                     last.bias[last.out_features // 2 :] = math.log(math.expm1(initial_scale))
 
-    def forward(self, state: Tensor, goal: Tensor, head: Head | None = None) -> tuple[Tensor, ...]:
-        """Embeddings of state and goal, which are the means, or what ``head`` makes of the means; then mean
-        and scale of each; all (\\*B, E)."""
-        of_state, of_goal = self.encoder(state, goal, _Gaussian(self.scale, head))
-        return of_state[0], of_goal[0], *of_state[1:], *of_goal[1:]
+    def forward(self, state: Tensor, goal: Tensor) -> tuple[Tensor, ...]:
+        """Embeddings of state and goal, which are the means; then mean, scale and KL of each; all (\\*B, E),
+        the KL (\\*B, 1)."""
+        return interleaved(*self.both(state, goal, (as_it_is, as_it_is)))
+
+    def both(self, state: Tensor, goal: Tensor, heads: Heads) -> tuple[Any, Any]:
+        """What the heads make of the means; then mean, scale and KL."""
+        return self.encoder.both(
+            state, goal, (_Gaussian(self.scale, heads[0]), _Gaussian(self.scale, heads[1]))
+        )
 
 
 class _Gaussian(NamedTuple):
-    """Codes to embedding, mean and scale; equal to another one if it does the same."""
+    """Codes to what the head makes of the mean, mean, scale and KL; equal to another one that does the
+    same."""
 
     scale: str
-    head: Head | None
+    head: Head
 
-    def __call__(self, code: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def __call__(self, code: Tensor) -> tuple[Tensor, ...]:
         loc, scale = code.chunk(2, -1)
-        embedding = loc if self.head is None else self.head(loc)
-        return embedding, loc, functional.softplus(scale) if self.scale == "softplus" else scale
+        if self.scale == "softplus":
+            scale = functional.softplus(scale)
+        made = self.head(loc)
+        kl = gaussian_kl(loc, scale).sum(-1, keepdim=True)
+        return *(made if isinstance(made, tuple) else (made,)), loc, scale, kl
 
 
 class LatentSampler(nn.Module):

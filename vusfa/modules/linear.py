@@ -105,7 +105,7 @@ class SceneLinear(nn.Module):
         return [functional.linear(part, weight, bias) for part, weight, bias in parts if len(part)]
 
     def _weights(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        if self._frozen is not None and not torch.is_grad_enabled():
+        if self._frozen is not None and (self._frozen[0].requires_grad or not torch.is_grad_enabled()):
             return self._frozen
         if not torch.is_autocast_enabled(x.device.type):
             return self.weight, self.bias
@@ -113,11 +113,15 @@ class SceneLinear(nn.Module):
         dtype = torch.get_autocast_dtype(x.device.type)
         return self.weight.to(dtype), self.bias.to(dtype)
 
-    @torch.no_grad()
-    def freeze(self) -> None:
-        """Converts the weights for autocast now, if it is on; calls without gradients use these until
-        :meth:`thaw`."""
-        self._frozen = self._weights(self.weight)
+    def freeze(self, grad: bool = False) -> None:
+        """Converts the weights for autocast now, if it is on, for calls until :meth:`thaw`.
+
+        Args:
+            grad: the converted weights carry gradients; otherwise calls with gradients convert anew.
+        """
+        with torch.set_grad_enabled(grad):
+            weight, bias = self._weights(self.weight)
+        self._frozen = (weight, bias) if grad else (weight.detach(), bias.detach())
 
     def thaw(self) -> None:
         """Uses the weights as they are again."""

@@ -17,7 +17,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -27,10 +27,12 @@ from vusfa.errors import ConfigError
 from vusfa.modules.frames import FeatureFrames, PictureFrames
 from vusfa.modules.linear import HistoryLinear, SceneLinear
 
-__all__ = ["Branch", "Head", "NormalisedEncoder", "SiameseEncoder", "frozen"]
+__all__ = ["Branch", "Head", "Heads", "NormalisedEncoder", "SiameseEncoder", "frozen"]
 
-#: What follows the encoder row by row: codes (D, out) to one or several tensors of D rows.
+#: What follows the encoder row by row: codes (D, out) to one or several tensors of D rows. One for states and
+#: one for goals; hashable, and equal where they do the same.
 Head = Callable[[Tensor], Any]
+Heads = tuple[Any, Any]
 
 
 class Branch(nn.Module):
@@ -92,18 +94,22 @@ class SiameseEncoder(nn.Module):
         self.history = history
         self.by_id = by_id
         self._frozen: tuple[Tensor, Tensor] | None = None
-        self._frozen_heads: dict[Head | None, tuple[Any, Any]] = {}
+        self._frozen_heads: dict[Heads, tuple[Any, Any]] = {}
         self.frames = frames
         self.branch = Branch(history, frames.size, hidden_size, out_features)
         self.goal_branch = None if shared else Branch(history, frames.size, hidden_size, out_features)
         self.state_layer = nn.Linear(hidden_size, hidden_size) if state_layer else None
 
-    def forward(self, state: Tensor, goal: Tensor, head: Head | None = None) -> tuple[Any, Any]:
-        """Codes of state and goal, (\\*B, out) each, float32; with a ``head``, what that makes of them."""
+    def forward(self, state: Tensor, goal: Tensor) -> tuple[Tensor, Tensor]:
+        """Codes of state and goal, (\\*B, out) each, float32."""
+        return self.both(state, goal, (as_it_is, as_it_is))
+
+    def both(self, state: Tensor, goal: Tensor, heads: Heads) -> tuple[Any, Any]:
+        """What the two heads make of the codes of state and goal, (\\*B, ...) each."""
         if self.by_id:
-            return self.from_ids(state, goal, head)
+            return self.from_ids(state, goal, heads)
         codes = self.from_observations(state, goal)
-        return _finish(codes[0], head), _finish(codes[1], head)
+        return heads[0](codes[0].float()), heads[1](codes[1].float())
 
     def from_observations(self, observation: Tensor, goal_observation: Tensor) -> tuple[Tensor, Tensor]:
         """Codes of observations: every frame of every row is encoded.
@@ -132,53 +138,54 @@ class SiameseEncoder(nn.Module):
         history = frames.narrow(place, frames.size(place) - self.history, self.history)
         return branch.first(self.frames.encode(history))
 
-    def from_ids(self, state_id: Tensor, goal_id: Tensor, head: Head | None = None) -> tuple[Any, Any]:
+    def from_ids(self, state_id: Tensor, goal_id: Tensor, heads: Heads | None = None) -> tuple[Any, Any]:
         """Codes of states by id: each distinct state of the batch is encoded once.
 
         Args:
             state_id: (\\*B, H) int64, oldest first. Of a longer history the last H frames are read.
             goal_id: (\\*B,) int64.
-            head: runs on distinct codes where they are fewer than the rows.
+            heads: of state and goal; they run on distinct codes where those are fewer than the rows.
 
         Returns:
-            codes of state and goal, (\\*B, out) each, float32; or what ``head`` makes of them.
+            codes of state and goal, (\\*B, out) each, float32; or what the heads make of them.
 
         Raises:
             ConfigError: fewer than H frames.
         """
         self._check_history(state_id.shape[-1], "state_id")
         states, goals = state_id[..., -self.history :].reshape(-1, self.history), goal_id.reshape(-1)
-        if self._frozen is not None and not torch.is_grad_enabled():
-            state, goal = self._from_frozen(states, goals, head)
+        heads = heads or (as_it_is, as_it_is)
+        if self._frozen is not None and (self._frozen[0].requires_grad or not torch.is_grad_enabled()):
+            state, goal = self._from_frozen(states, goals, heads)
         else:
-            state, goal = self._from_distinct(states, goals, head)
+            state, goal = self._from_distinct(states, goals, heads)
         shape = goal_id.shape
         return _map(state, lambda rows: rows.view(*shape, -1)), _map(goal, lambda rows: rows.view(*shape, -1))
 
-    def _from_distinct(self, states: Tensor, goals: Tensor, head: Head | None) -> tuple[Any, Any]:
+    def _from_distinct(self, states: Tensor, goals: Tensor, heads: Heads) -> tuple[Any, Any]:
         features, state_row, goal_row = self._distinct_features(states, goals)
         goal_row, goal_index = torch.unique(goal_row, return_inverse=True)
         first = self.branch.first
         if self.history == 1:
             each = first(features.unsqueeze(-2))
-            distinct = _finish(self.branch.finish(each, self.state_layer), head)
+            distinct = heads[0](self.branch.finish(each, self.state_layer).float())
             state = _lookup(distinct, state_row.squeeze(-1))
             goal_first = functional.embedding(goal_row, each)
         elif len(features) <= len(states):
             projected = first.project(features)
             code = self.branch.finish(first.gather(projected, state_row), self.state_layer)
-            state = _finish(code, head)
+            state = heads[0](code.float())
             goal_first = first.gather(projected, goal_row.unsqueeze(-1).expand(-1, self.history))
         else:
             # Fewer rows than distinct frames: every frame with every place's weight would be the longer way.
             histories = functional.embedding(state_row, features)
-            state = _finish(self.branch.finish(first(histories), self.state_layer), head)
+            state = heads[0](self.branch.finish(first(histories), self.state_layer).float())
             goal_first = first.repeated(functional.embedding(goal_row, features))
         goal_branch = self.branch
         if self.goal_branch is not None:
             goal_branch = self.goal_branch
             goal_first = goal_branch.first.repeated(functional.embedding(goal_row, features))
-        return state, _lookup(_finish(goal_branch.finish(goal_first), head), goal_index)
+        return state, _lookup(heads[1](goal_branch.finish(goal_first).float()), goal_index)
 
     def _distinct_features(self, states: Tensor, goals: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Features (D, F) of the batch's distinct states, and each id's row in them: (R, H) and (R,).
@@ -190,35 +197,35 @@ class SiameseEncoder(nn.Module):
         distinct, row = torch.unique(torch.cat([states.flatten(), goals]), return_inverse=True)
         return self.frames.lookup(distinct), row[: states.numel()].view_as(states), row[states.numel() :]
 
-    def _from_frozen(self, states: Tensor, goals: Tensor, head: Head | None) -> tuple[Any, Any]:
+    def _from_frozen(self, states: Tensor, goals: Tensor, heads: Heads) -> tuple[Any, Any]:
         assert self._frozen is not None
         state_part, goal_codes = self._frozen
         one = self.history == 1
-        if head not in self._frozen_heads:
-            self._frozen_heads[head] = _finish(state_part, head) if one else None, _finish(goal_codes, head)
-        state_table, goal_table = self._frozen_heads[head]
+        if heads not in self._frozen_heads:
+            # with gradients wherever the codes have them: collecting comes first, and has none
+            with torch.set_grad_enabled(goal_codes.requires_grad):
+                tables = heads[0](state_part) if one else None, heads[1](goal_codes)
+            self._frozen_heads[heads] = tables
+        state_table, goal_table = self._frozen_heads[heads]
         goal = _lookup(goal_table, goals)
         if one:
             return _lookup(state_table, states.squeeze(-1)), goal
         code = self.branch.finish(self.branch.first.gather(state_part, states), self.state_layer)
-        return _finish(code, head), goal
+        return heads[0](code.float()), goal
 
-    @torch.no_grad()
-    def freeze(self) -> None:
-        """Encodes all states of the world now; calls without gradients look them up until :meth:`thaw`.
-
-        For evaluation, where the weights stand still. Changing them meanwhile changes nothing that is
-        looked up.
-        """
+    def freeze(self, grad: bool = False) -> None:
+        """Encodes all states of the world now; calls until :meth:`thaw` look them up. See :func:`frozen`."""
         if not self.by_id:
             return
-        features, first = self.frames.lookup(None), self.branch.first
-        if self.history == 1:
-            state_part = self.branch.finish(first(features.unsqueeze(-2)), self.state_layer)
-        else:
-            state_part = first.project(features)
-        goal_branch = self.goal_branch or self.branch
-        self._frozen = (state_part, goal_branch.finish(goal_branch.first.repeated(features)))
+        with torch.set_grad_enabled(grad):
+            features, first = self.frames.lookup(None), self.branch.first
+            if self.history == 1:
+                state_part = self.branch.finish(first(features.unsqueeze(-2)), self.state_layer).float()
+            else:
+                state_part = first.project(features)
+            goal_branch = self.goal_branch or self.branch
+            goal_codes = goal_branch.finish(goal_branch.first.repeated(features)).float()
+        self._frozen = state_part, goal_codes
 
     def thaw(self) -> None:
         """Encodes with the weights as they are again."""
@@ -244,30 +251,47 @@ class NormalisedEncoder(nn.Module):
     Args:
         encoder: returns the two embeddings first, (\\*B, E) each.
 
-    >>> def encoder(state, goal, head):
-    ...     return head(2 * state), head(goal - 5.0)
-    >>> state, goal = NormalisedEncoder(encoder)(torch.tensor([[-1.0, 1.0]]), torch.tensor([[3.0, 1.0]]))
-    >>> state.round(decimals=3), goal.round(decimals=3)
-    (tensor([[-1.,  1.]]), tensor([[ 1., -1.]]))
+    >>> from vusfa.modules.frames import FeatureFrames
+    >>> encoder = SiameseEncoder(FeatureFrames(torch.rand(12, 1, 8)), 1, hidden_size=16, out_features=6)
+    >>> state, goal = NormalisedEncoder(encoder)(torch.tensor([[3], [5]]), torch.tensor([7, 7]))
+    >>> bool((state.mean(-1).abs() < 1e-6).all()), bool((goal.std(-1, correction=0) - 1 < 1e-4).all())
+    (True, True)
     """
 
-    def __init__(self, encoder: Callable[..., tuple[Tensor, ...]]) -> None:
+    def __init__(self, encoder: Any) -> None:
         super().__init__()
         self.encoder = encoder
 
     def forward(self, state: Tensor, goal: Tensor) -> tuple[Tensor, ...]:
-        """The encoder's outputs, the first two normalised."""
-        return self.encoder(state, goal, _normalised)
+        """Both embeddings, and what else the encoder returns."""
+        return interleaved(*self.both(state, goal, (as_it_is, as_it_is)))
+
+    def both(self, state: Tensor, goal: Tensor, heads: Heads) -> tuple[Any, Any]:
+        """What the heads make of the normalised embeddings, and what else the encoder returns."""
+        return self.encoder.both(state, goal, (_Normalised(heads[0]), _Normalised(heads[1])))
 
 
-def _normalised(embedding: Tensor) -> Tensor:
-    return functional.layer_norm(embedding, embedding.shape[-1:])
+class _Normalised(NamedTuple):
+    head: Head
+
+    def __call__(self, embedding: Tensor) -> Any:
+        return self.head(functional.layer_norm(embedding, embedding.shape[-1:]))
 
 
-def _finish(code: Tensor, head: Head | None) -> Any:
-    # Under autocast the layers give half precision; embeddings are compared, summed and squared further on.
-    code = code.float()
-    return code if head is None else head(code)
+def interleaved(of_state: Any, of_goal: Any) -> tuple[Tensor, ...]:
+    """``(e_s, a_s, b_s), (e_g, a_g, b_g)`` to ``e_s, e_g, a_s, b_s, a_g, b_g``: embeddings first.
+
+    >>> interleaved((1, 2, 3), (4, 5, 6))
+    (1, 4, 2, 3, 5, 6)
+    """
+    if not isinstance(of_state, tuple):
+        return of_state, of_goal
+    return of_state[0], of_goal[0], *of_state[1:], *of_goal[1:]
+
+
+def as_it_is(code: Tensor) -> Tensor:
+    """The head of whoever wants the codes themselves."""
+    return code
 
 
 def _map(parts: Any, function: Callable[[Tensor], Tensor]) -> Any:
@@ -285,12 +309,17 @@ def _lookup(table: Any, index: Tensor) -> Any:
 
 
 @contextmanager
-def frozen(module: nn.Module) -> Iterator[None]:
+def frozen(module: nn.Module, grad: bool = False) -> Iterator[None]:
     """Within it, every siamese encoder in ``module`` looks up what it encoded on the way in, and scenes'
     weights are converted for autocast once.
 
-    The weights must not change meanwhile. Gradients are not affected: with gradients on, encoding is done
-    anew. Other modules are left as they are, so any policy may be passed.
+    The weights must not change meanwhile. Other modules are left as they are, so any policy may be passed.
+
+    Args:
+        module: an agent, or any part of one.
+        grad: what is looked up carries gradients to the weights, where gradients are on: for an update, which
+            then encodes the world once for collecting and for the loss. Otherwise calls with gradients encode
+            anew.
 
     >>> from vusfa.modules import make_agent
     >>> from vusfa.scenes import SceneSet
@@ -301,7 +330,7 @@ def frozen(module: nn.Module) -> Iterator[None]:
     parts = [part for part in module.modules() if isinstance(part, SiameseEncoder | SceneLinear)]
     try:
         for part in parts:
-            part.freeze()
+            part.freeze(grad)
         yield
     finally:
         for part in parts:

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-import torch
+from typing import Any, NamedTuple
+
 from torch import Tensor, nn
 from torch.nn import functional
 
 from vusfa.modules.linear import SceneLinear
 
-__all__ = ["Fusion", "SceneLayer"]
+__all__ = ["Fusion", "SceneLayer", "SiameseTrunk"]
 
 
 class Fusion(nn.Module):
@@ -18,6 +19,7 @@ class Fusion(nn.Module):
         embedding_size: E.
         hidden_size: outputs.
 
+    >>> import torch
     >>> Fusion(16, 32)(torch.randn(5, 16), torch.randn(5, 16)).shape
     torch.Size([5, 32])
     """
@@ -28,7 +30,60 @@ class Fusion(nn.Module):
 
     def forward(self, state_embedding: Tensor, goal_embedding: Tensor) -> Tensor:
         """(\\*B, E) twice to (\\*B, hidden_size)."""
-        return functional.relu(self.linear(torch.cat([state_embedding, goal_embedding], -1)))
+        return functional.relu(self.state_part(state_embedding) + self.goal_part(goal_embedding))
+
+    def state_part(self, embedding: Tensor) -> Tensor:
+        """What the state's embedding (\\*B, E) adds to the layer's sums, (\\*B, hidden_size); without the
+        bias."""
+        return functional.linear(embedding, self.linear.weight[:, : embedding.shape[-1]])
+
+    def goal_part(self, embedding: Tensor) -> Tensor:
+        """What the goal's embedding (\\*B, E) adds to them, and the bias, (\\*B, hidden_size)."""
+        weight = self.linear.weight[:, -embedding.shape[-1] :]
+        return functional.linear(embedding, weight, self.linear.bias)
+
+
+class SiameseTrunk(nn.Module):
+    """The encoder and the fusion of what it gives, as one module.
+
+    The fusing layer's sum has one part of the state alone and one of the goal alone. So these are computed
+    where the encoder has distinct states and goals at hand, and only their sum row by row.
+
+    Args:
+        encoder: siamese encoder, or one around it, with ``both``.
+        fusion: reads both embeddings.
+
+    >>> import torch
+    >>> from vusfa.modules.frames import FeatureFrames
+    >>> from vusfa.modules.siamese import SiameseEncoder
+    >>> trunk = SiameseTrunk(SiameseEncoder(FeatureFrames(torch.rand(12, 1, 8)), 4, 16, 6), Fusion(6, 32))
+    >>> state, goal, fused = trunk(torch.zeros(3, 4, dtype=torch.int64), torch.arange(3))
+    >>> torch.allclose(fused, trunk.fusion(state, goal), atol=1e-6)
+    True
+    """
+
+    def __init__(self, encoder: Any, fusion: Fusion) -> None:
+        super().__init__()
+        self.encoder = encoder
+        self.fusion = fusion
+
+    def forward(self, state: Tensor, goal: Tensor) -> tuple[Tensor, ...]:
+        """Embeddings of state and goal, what else the encoder returns, and last the fused (\\*B, hidden)."""
+        heads = _Fused(self.fusion, "state_part"), _Fused(self.fusion, "goal_part")
+        of_state, of_goal = self.encoder.both(state, goal, heads)
+        (state_embedding, state_part, *rest), (goal_embedding, goal_part, *goal_rest) = of_state, of_goal
+        fused = functional.relu(state_part + goal_part)
+        return state_embedding, goal_embedding, *rest, *goal_rest, fused
+
+
+class _Fused(NamedTuple):
+    """Embeddings to themselves and their part of the fusion; equal to another one that does the same."""
+
+    fusion: Fusion
+    part: str
+
+    def __call__(self, embedding: Tensor) -> tuple[Tensor, Tensor]:
+        return embedding, getattr(self.fusion, self.part)(embedding)
 
 
 class SceneLayer(nn.Module):
@@ -39,6 +94,7 @@ class SceneLayer(nn.Module):
         in_features: size of a row.
         hidden_size: outputs.
 
+    >>> import torch
     >>> SceneLayer(2, 32, 32)(torch.randn(5, 32), torch.tensor([0, 1, 1, 0, 1])).shape
     torch.Size([5, 32])
     """

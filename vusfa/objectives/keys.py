@@ -61,6 +61,9 @@ class LossKeys:
         state_scale: its scale.
         goal_loc: mean of the goal's latent, which the critic writes.
         goal_scale: its scale.
+        state_kl: divergence of the state's latent from N(0, 1), summed over its features, where the critic
+            writes it; computed from mean and scale where not.
+        goal_kl: that of the goal's latent.
         action: the action taken, or a list of keys for a composite action.
         reward: under ``"next"``.
         done: under ``"next"``.
@@ -82,6 +85,8 @@ class LossKeys:
     state_scale: NestedKey = "state_scale"
     goal_loc: NestedKey = "goal_loc"
     goal_scale: NestedKey = "goal_scale"
+    state_kl: NestedKey = "state_kl"
+    goal_kl: NestedKey = "goal_kl"
     action: NestedKey | list[NestedKey] = "action"
     reward: NestedKey = "reward"
     done: NestedKey = "done"

@@ -142,6 +142,7 @@ class USFEstimator(ValueEstimatorBase):
         params: TensorDictBase | None = None,
         target_params: TensorDictBase | None = None,
         time_dim: int | None = None,
+        written: TensorDictBase | None = None,
     ) -> TensorDictBase:
         """Write the targets into a rollout.
 
@@ -151,6 +152,8 @@ class USFEstimator(ValueEstimatorBase):
             params: the critic's parameters; its own, when ``None``.
             target_params: used in the place of ``params`` when given.
             time_dim: the dimension of time.
+            written: ``(*batch, T)``, what the critic writes at the root states, by whoever has run it there
+                already. Not differentiated. A recurrent critic is run all the same.
 
         Returns:
             the same tensordict, with ``advantage`` and ``value_target``, ``(*batch, T, 1)``, and
@@ -166,7 +169,9 @@ class USFEstimator(ValueEstimatorBase):
         time_dim = self._get_time_dim(time_dim, tensordict)
         last = tensordict.batch_dims - 1
         data = tensordict if time_dim == last else tensordict.transpose(time_dim, last)
-        targets = self._targets(data, params if target_params is None else target_params)
+        if written is not None and time_dim != last:
+            written = written.transpose(time_dim, last)
+        targets = self._targets(data, params if target_params is None else target_params, written)
         if time_dim != last:
             targets = targets.transpose(time_dim, last)
         return tensordict.update(targets)
@@ -187,7 +192,9 @@ class USFEstimator(ValueEstimatorBase):
         return targets.get(self.tensor_keys.value_target)
 
     @torch.no_grad()
-    def _targets(self, data: TensorDictBase, params: TensorDictBase | None) -> TensorDict:
+    def _targets(
+        self, data: TensorDictBase, params: TensorDictBase | None, written: TensorDictBase | None
+    ) -> TensorDict:
         keys = self.tensor_keys
         reward = data.get(("next", keys.reward))
         done = data.get(("next", keys.done))
@@ -205,7 +212,7 @@ class USFEstimator(ValueEstimatorBase):
             if params is None
             else params.to_module(self.value_network, preserve_module_state=False)
         ):
-            root, following = evaluate_rollout(self.value_network, data, ended.any(-1), wanted)
+            root, following = evaluate_rollout(self.value_network, data, ended.any(-1), wanted, written)
         value, next_value = root[0].to(reward.dtype), following[0].to(reward.dtype)
         if not self.has_successor:
             value_target = self._return(reward, next_value, ended, terminated)
@@ -240,6 +247,7 @@ def evaluate_rollout(
     data: TensorDictBase,
     ended: Tensor,
     out_keys: list[NestedKey],
+    written: TensorDictBase | None = None,
 ) -> tuple[list[Tensor], list[Tensor]]:
     """A critic's outputs at the states of a rollout and at those that its steps lead to.
 
@@ -249,6 +257,8 @@ def evaluate_rollout(
             goal that stays) is taken from the root.
         ended: ``(*batch, T)``, bool: the next root does not follow from this step.
         out_keys: the outputs wanted.
+        written: ``(*batch, T)``, the outputs at the root states, where they are known; not for recurrent
+            critics.
 
     Returns:
         two lists in the order of ``out_keys``, of ``(*batch, T, ...)``: at the root states, and at the next
@@ -262,16 +272,22 @@ def evaluate_rollout(
     if any((key if isinstance(key, str) else key[-1]) == "is_init" for key in in_keys):
         return _evaluate_sequences(critic, root, following, outside, in_keys, out_keys)
 
-    # states are independent of each other: one flat batch of the roots and of next states that are no root
+    # states are independent of each other: one flat batch of the roots, unless they are known, and of next
+    # states that are no root
     rows = outside.reshape(-1).nonzero().squeeze(-1)
-    steps = outside.numel()
+    steps, shape = outside.numel(), outside.shape
     root = root.reshape(-1)
-    batch = torch.cat([root, _complete(following.reshape(-1)[rows], root[rows], in_keys)])
-    outputs = critic(batch)
+    ends = _complete(following.reshape(-1)[rows], root[rows], in_keys)
+    if written is None:
+        outputs = critic(torch.cat([root, ends]))
+        values = [outputs.get(key) for key in out_keys]
+    else:
+        outputs = critic(ends)
+        known = [written.get(key) for key in out_keys]
+        pairs = zip(known, [outputs.get(key) for key in out_keys], strict=True)
+        values = [torch.cat([at_root.reshape(steps, *end.shape[1:]), end]) for at_root, end in pairs]
     next_rows = torch.arange(1, steps + 1, device=rows.device)
     next_rows[rows] = torch.arange(steps, steps + len(rows), device=rows.device)
-    values = [outputs.get(key) for key in out_keys]
-    shape = outside.shape
     return (
         [value[:steps].reshape(*shape, *value.shape[1:]) for value in values],
         [value[next_rows].reshape(*shape, *value.shape[1:]) for value in values],

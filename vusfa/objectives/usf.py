@@ -70,8 +70,8 @@ class USFLoss(LossModule):
     coefficient is ``None``, or whose entries the critic does not write, is left out; so this is a plain
     advantage actor-critic loss for a critic that writes a value only.
 
-    If the input has no advantage, the estimator computes it first. Modules that actor and critic both hold
-    run once.
+    If the input has no advantage, the estimator computes it, from the same pass through the critic. Modules
+    that actor and critic both hold run once.
 
     Args:
         actor_network: the policy, with ``get_dist``.
@@ -285,10 +285,12 @@ class USFLoss(LossModule):
             KeyError: when there is an advantage but not the other targets that the terms need.
         """
         tensordict = tensordict.clone(False)
-        if tensordict.get(self.tensor_keys.advantage, None) is None:
-            params = self.critic_network_params
-            self.value_estimator(tensordict, params=params, target_params=params)
         results = self._evaluate(tensordict)
+        if tensordict.get(self.tensor_keys.advantage, None) is None:
+            params, estimator = self.critic_network_params, self.value_estimator
+            # the estimator needs the critic at the same states
+            known = {"written": results.written} if isinstance(estimator, USFEstimator) else {}
+            estimator(tensordict, params=params, target_params=params, **known)
         out = TensorDict({}, batch_size=[])
         if self.objective_coeff is not None:
             self._set_term(out, "loss_objective", self.loss_objective(tensordict, results), tensordict)
@@ -350,9 +352,7 @@ class USFLoss(LossModule):
     ) -> tuple[Tensor, Tensor]:
         """The information constraint's term, ``beta (KL - I_c)``, and KL, both ``(*batch,)``."""
         written = (results or self._evaluate(tensordict)).written
-        divergences = [gaussian_kl(written.get(loc), written.get(scale)) for loc, scale in self._branches()]
-        kl = torch.stack(divergences).mean(0)
-        kl = kl.sum(-1) if self.information_reduction == "sum" else kl.mean(-1)
+        kl = torch.stack([self._divergence(written, branch) for branch in self._branches()]).mean(0)
         # a copy: the multiplier may move before this graph is differentiated
         beta = self.bottleneck_coeff.detach().clone()
         return information_bottleneck(kl, beta, self.information_target), kl.detach()
@@ -417,12 +417,23 @@ class USFLoss(LossModule):
         written = {unravel_key(key) for key in self.critic_network.out_keys}
         return all(unravel_key(key) in written for key in keys)
 
-    def _branches(self) -> list[tuple[NestedKey, NestedKey]]:
-        """Keys of mean and scale of the latents whose information counts."""
+    def _branches(self) -> list[tuple[NestedKey, NestedKey, NestedKey]]:
+        """Keys of mean, scale and divergence of the latents whose information counts."""
         keys = self.tensor_keys
-        branches = {"goal": (keys.goal_loc, keys.goal_scale), "state": (keys.state_loc, keys.state_scale)}
+        branches = {
+            "goal": (keys.goal_loc, keys.goal_scale, keys.goal_kl),
+            "state": (keys.state_loc, keys.state_scale, keys.state_kl),
+        }
         chosen = branches if self.bottleneck_on == "both" else [self.bottleneck_on]
-        return [branches[name] for name in chosen if self._writes(*branches[name])]
+        return [branches[name] for name in chosen if self._writes(*branches[name][:2])]
+
+    def _divergence(self, written: TensorDictBase, branch: tuple[NestedKey, NestedKey, NestedKey]) -> Tensor:
+        """KL of one latent, ``(*batch,)``, its features reduced."""
+        loc, scale, known = branch
+        features = written.get(loc).shape[-1] if self.information_reduction == "mean" else 1
+        if self._writes(known):
+            return written.get(known).squeeze(-1) / features
+        return gaussian_kl(written.get(loc), written.get(scale)).sum(-1) / features
 
     def _target(self, tensordict: TensorDictBase, name: str) -> Tensor:
         key = getattr(self.tensor_keys, name)

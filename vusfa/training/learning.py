@@ -50,8 +50,8 @@ def make_loss(
     bootstrap_at_timeout: bool = True,
     embedding_at: str = "next",
 ) -> tuple[LossModule, USFEstimator, DualAscent | None]:
-    """The loss that fits the critic, the estimator of its targets, and the multiplier's ascent where there is
-    one.
+    """The loss that fits the critic, the estimator of its targets, which the loss calls where a batch has
+    none, and the multiplier's ascent where there is one.
 
     A critic with successor features gets :class:`~vusfa.objectives.USFLoss`; a plain one, as GVF's, gets
     TorchRL's :class:`~torchrl.objectives.A2CLoss` with the same coefficients and the same targets.
@@ -84,6 +84,7 @@ def make_loss(
                 loss_critic_type=loss_critic_type,
             )
             plain.register_buffer("objective_coeff", torch.tensor(float(objective_coeff)))
+            plain.make_value_estimator(estimator)
             return plain, estimator, None
         loss = USFLoss(
             actor,
@@ -98,6 +99,7 @@ def make_loss(
             information_reduction=information_reduction,  # type: ignore[arg-type]
             loss_critic_type=loss_critic_type,  # type: ignore[arg-type]
         )
+        loss.make_value_estimator(estimator)
         ascent = DualAscent(loss, bottleneck_step_size, bottleneck_maximum) if loss.has_bottleneck else None
         return loss, estimator, ascent
     except ValueError as error:

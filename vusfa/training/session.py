@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import secrets
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, nullcontext
+from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -104,23 +104,30 @@ class Session:
                 load_collector_state(collector, self._waiting["collector"])
                 restore_random_state(self._waiting["rng"])  # last: what came before has drawn
                 self._waiting = {}
-            yield self._batches(collector)
+            yield iter(collector)
         finally:
             self._collector = None
             close_collector(collector)
             torch.set_num_threads(threads)
 
-    def _batches(self, collector: BaseCollector) -> Iterator[TensorDictBase]:
-        """The collector's batches. Where a batch has at least as many frames as the world has states,
-        encoding the whole world once before each batch is the shorter way; the weights stand still
-        meanwhile."""
+    @contextmanager
+    def encoded_once(self, precision: Callable[[], AbstractContextManager] = nullcontext) -> Iterator[None]:
+        """For one update, within :meth:`collecting`: the whole world is encoded on the way in, and collecting
+        and the loss look it up. The weights may change only after it.
+
+        Where a batch has less than half as many frames as the world has states, the batch's states are
+        encoded as they come, which is the shorter way then; so they are for a collector with workers.
+
+        Args:
+            precision: context to encode in, such as autocast.
+        """
+        collector = self._collector
         here = isinstance(collector, Collector)
-        worthwhile = here and collector.requested_frames_per_batch >= self.scenes.num_states
-        batches = iter(collector)
-        while True:
-            with frozen(self.agent) if worthwhile else nullcontext():
-                batch = next(batches)
-            yield batch
+        with ExitStack() as stack:
+            if here and 2 * collector.requested_frames_per_batch >= self.scenes.num_states:
+                with precision():
+                    stack.enter_context(frozen(self.agent, grad=True))
+            yield
 
     def count(self, batch: TensorDictBase, terms: Mapping[str, Tensor], seconds: float) -> None:
         """One update has been made.
