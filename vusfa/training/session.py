@@ -122,9 +122,9 @@ class Session:
             precision: context to encode in, such as autocast.
         """
         collector = self._collector
-        here = isinstance(collector, Collector)
+        frames = collector.requested_frames_per_batch if isinstance(collector, Collector) else 0
         with ExitStack() as stack:
-            if here and 2 * collector.requested_frames_per_batch >= self.scenes.num_states:
+            if 2 * frames >= self.scenes.num_states:
                 with precision():
                     stack.enter_context(frozen(self.agent, grad=True))
             yield
