@@ -61,7 +61,6 @@ class Trainer:
     Attributes:
         session: the recipe's, with agent, loss, optimiser, frames and meters.
         batches: the collector's.
-        estimator: of the targets.
     """
 
     def __init__(self, cfg: DictConfig, scenes: SceneSet | None = None) -> None:
@@ -74,8 +73,8 @@ class Trainer:
         goals = resolve_goals(scenes, plain["env"]["goals"])
         given = {key: value for key, value in plain["agent"].items() if value is not None}
         agent = make_agent(scenes=scenes, **given).to(device)
-        actor, critic = agent.get_policy_operator(), agent.get_value_operator()
-        loss, self.estimator, self._multiplier = make_loss(
+        actor, critic = agent.get_policy_operator(out_keys=["action"]), agent.get_value_operator()
+        loss, _, self._multiplier = make_loss(
             actor, critic, entropy_coeff=plain["entropy"]["start"], **plain["objective"]
         )
         optim = plain["optim"]
@@ -107,7 +106,7 @@ class Trainer:
 
     def collect(self) -> int:
         """Collect one batch and throw it away; the frames it has."""
-        with self._half():
+        with self.session.encoded_once(self._half), self._half():
             return next(self.batches).numel()
 
     def update(self) -> int:
@@ -116,10 +115,11 @@ class Trainer:
         before = session.frames
         lr = annealed(before, optim["lr"], optim["horizon"])
         session.loss.entropy_coeff = annealed(before, **self._plain["entropy"])
-        with self._half():
-            batch = self.estimator(next(self.batches))
-        with self._half():
-            terms = session.loss(batch)
+        with session.encoded_once(self._half):
+            with self._half():
+                batch = next(self.batches)
+            with self._half():
+                terms = session.loss(batch)
         norm = descend(session.optimiser, total_loss(session.loss, terms), lr, optim["max_grad_norm"])
         if self._multiplier is not None:
             self._multiplier.step()

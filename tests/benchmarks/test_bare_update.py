@@ -39,7 +39,7 @@ def test_loss_and_gradients_are_those_of_the_library(model: str, history: int, t
     batch = next(trainer.batches).clone()
     assert batch["next", "done"].any()
     loss = session.loss
-    expected = total_loss(loss, loss(trainer.estimator(batch)))
+    expected = total_loss(loss, loss(batch))
     expected.backward()
     plain = _as_bare(batch, bare)
     net = bare.net
