@@ -25,6 +25,7 @@ class Options:
         seconds: of a turn.
         threads: of torch, where two cores are spoken of.
         cap: seconds after which a training counts as not solving the task.
+        overrides: settings of the recipe that are not its default ones.
     """
 
     quick: bool = False
@@ -32,6 +33,7 @@ class Options:
     seconds: float = 1.0
     threads: int = 2
     cap: float = 900.0
+    overrides: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)

@@ -7,6 +7,7 @@ The exit code is 1 when a requirement fails, except with --quick, whose numbers 
 from __future__ import annotations
 
 import sys
+from dataclasses import replace
 from enum import StrEnum
 from importlib import import_module
 from pathlib import Path
@@ -59,11 +60,14 @@ def main(
     repetitions: Annotated[int, typer.Option(min=1, help="turns of each workload")] = 5,
     seconds: Annotated[float, typer.Option(min=0.0, help="of a turn")] = 1.0,
     cap: Annotated[float, typer.Option(min=0.0, help="seconds that a training may take to solve")] = 900.0,
+    change: Annotated[
+        list[str] | None, typer.Option("--set", help="a recipe's setting: autocast=true")
+    ] = None,
 ) -> None:
     """Measure, print and write down."""
-    options = Options(quick, repetitions, seconds, threads, cap)
+    options = Options(quick, repetitions, seconds, threads, cap, tuple(change or ()))
     if quick:
-        options = Options(quick, 1, 0.0, threads, min(cap, 5.0))
+        options = replace(options, repetitions=1, seconds=0.0)
     console, machine = Console(), describe_machine()
     machine["foreign_load"] = round(foreign_load(), 2)
     print_machine(machine, console)

@@ -143,8 +143,8 @@ def make_trainer(overrides: Sequence[str] = (), scenes: SceneSet | None = None) 
 
 
 def small(options: Options) -> list[str]:
-    """Overrides that make a training tiny, for ``--quick``; none otherwise."""
+    """What the options change of the recipe's settings: all tiny with ``--quick``, then what was given."""
     if not options.quick:
-        return []
+        return list(options.overrides)
     sizes = ["agent.hidden_size=16", "agent.embedding_size=16"]
-    return ["scenes=[bathroom]", *sizes, "collector.num_envs=8", "collector.rollout=4"]
+    return ["scenes=[bathroom]", *sizes, "collector.num_envs=8", "collector.rollout=4", *options.overrides]

@@ -91,7 +91,7 @@ class BareTraining:
         )
         self.beta = torch.tensor(float(self.objective["bottleneck_coeff"]))
         self.optimiser = torch.optim.Adam(
-            self.params, lr=self.optim["lr"], fused=True, **self.optim["options"]
+            self.params, lr=self.optim["lr"], **{"fused": True, **self.optim["options"]}
         )
         self.frames = 0
 

@@ -60,7 +60,7 @@ def test_a_suite_yields_its_rows(name: str):
     report: Report = import_module(f"benchmarks.{name}").run(QUICK)
     names = [row.name for row in report.rows]
     for pattern in PROMISED[name]:
-        assert any(re.match(pattern, found) for found in names), (pattern, names)
+        assert any(re.search(pattern, found) for found in names), (pattern, names)
     assert all(row.value > 0 or math.isnan(row.value) or "growth" in row.name for row in report.rows)
     assert all(row.ratio is None or row.ratio > 0 for row in report.rows)
 
