@@ -88,7 +88,7 @@ def train_until(
     >>> ticks = iter(range(100))
     >>> outcome = train_until(lambda: 8, lambda: (1.0, 1.0), cap=9, every=2, clock=lambda: next(ticks))
     >>> outcome.seconds, outcome.frames
-    (2, 16)
+    (2.0, 16)
     """
     spent, checked, frames = 0.0, 0.0, 0
     while True:
