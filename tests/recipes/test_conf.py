@@ -102,7 +102,7 @@ def test_the_numbers_of_controlled(settings):
         "lr": 5e-4,
         "horizon": 1_000_000,
         "max_grad_norm": 1.0,
-        "options": {"eps": 1e-5},
+        "options": {"eps": 1e-5, "fused": True},
     }
     assert cfg.collector == {"kind": "single", "num_envs": 64, "rollout": 20, "num_workers": 1}
     assert cfg.env.goal_sampling == "episode"
