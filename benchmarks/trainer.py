@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import ExitStack
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -17,22 +16,8 @@ import torch
 from omegaconf import DictConfig, OmegaConf
 
 from benchmarks.report import Options
-from vusfa.envs import resolve_goals
-from vusfa.modules import make_agent
 from vusfa.scenes import SceneSet
-from vusfa.training import (
-    Session,
-    annealed,
-    descend,
-    make_collector,
-    make_env,
-    make_loss,
-    make_observation,
-    make_optimiser,
-    scene_sources,
-    torch_device,
-    total_loss,
-)
+from vusfa.training import make_training
 from vusfa.training.launch import compose
 
 __all__ = ["CONF", "Trainer", "make_trainer", "recipe_settings", "small"]
@@ -65,39 +50,11 @@ class Trainer:
 
     def __init__(self, cfg: DictConfig, scenes: SceneSet | None = None) -> None:
         self.cfg = cfg
-        torch.manual_seed(cfg.seed)
         plain: dict[str, Any] = OmegaConf.to_container(cfg, resolve=True)  # type: ignore[assignment]
-        self._plain, device = plain, torch_device(cfg.device)
-        self._half = partial(torch.autocast, device.type, torch.bfloat16, enabled=cfg.autocast)
-        scenes = SceneSet.open(cfg.scenes) if scenes is None else scenes
-        goals = resolve_goals(scenes, plain["env"]["goals"])
-        given = {key: value for key, value in plain["agent"].items() if value is not None}
-        agent = make_agent(scenes=scenes, **given).to(device)
-        actor, critic = agent.get_policy_operator(out_keys=["action"]), agent.get_value_operator()
-        loss, _, self._multiplier = make_loss(
-            actor, critic, entropy_coeff=plain["entropy"]["start"], **plain["objective"]
-        )
-        optim = plain["optim"]
-        optimiser = make_optimiser(
-            agent.parameters(), optim["kind"], optim["lr"], optim["max_grad_norm"], **optim["options"]
-        )
-        settings = {"config": plain, "overrides": [], "sources": scene_sources(cfg.scenes)}
-        self.session = Session(scenes, goals, agent, loss.to(device), optimiser, settings)
-        task = {**plain["env"], "goals": goals}
-        observation = make_observation(agent, scenes, task.pop("crop"))
-        transforms = [*([observation] if observation is not None else []), *agent.make_env_transforms()]
-        env = partial(make_env, scenes, transforms, history=agent.config["history"], device=device, **task)
-        collector = partial(
-            make_collector,
-            make_env=env,
-            policy=actor,
-            seed=cfg.seed,
-            autocast=cfg.autocast,
-            **plain["collector"],
-        )
-        self.actor = actor
+        self._training = make_training(plain, scenes=scenes)
+        self.session, self.actor = self._training.session, self._training.actor
         self._open = ExitStack()
-        self.batches = self._open.enter_context(self.session.collecting(collector))
+        self.batches = self._open.enter_context(self.session.collecting(self._training.make_collector))
 
     @property
     def agent(self) -> torch.nn.Module:
@@ -106,25 +63,13 @@ class Trainer:
 
     def collect(self) -> int:
         """Collect one batch and throw it away; the frames it has."""
-        with self.session.encoded_once(self._half), self._half():
-            return next(self.batches).numel()
+        return self._training.collect(self.batches).numel()
 
     def update(self) -> int:
         """Collect, compute returns and loss, step the optimiser; the frames that it took."""
-        session, optim = self.session, self._plain["optim"]
-        before = session.frames
-        lr = annealed(before, optim["lr"], optim["horizon"])
-        session.loss.entropy_coeff = annealed(before, **self._plain["entropy"])
-        with session.encoded_once(self._half):
-            with self._half():
-                batch = next(self.batches)
-            with self._half():
-                terms = session.loss(batch)
-        norm = descend(session.optimiser, total_loss(session.loss, terms), lr, optim["max_grad_norm"])
-        if self._multiplier is not None:
-            self._multiplier.step()
-        session.count(batch, {**terms, "grad_norm": norm}, 0.0)
-        return session.frames - before
+        batch, terms = self._training.update(self.batches)
+        self.session.count(batch, terms, 0.0)
+        return batch.numel()
 
     def close(self) -> None:
         """End the collector's processes."""

@@ -11,22 +11,27 @@ from vusfa.objectives.functional import (
     successor_loss,
     successor_return,
 )
+from vusfa.objectives.hindsight import HindsightLoss, expectile_loss, relabelled_target, walked_return
 from vusfa.objectives.optim import DualAscent, TFRMSprop
 from vusfa.objectives.returns import USFEstimator
 from vusfa.objectives.usf import USFLoss
 
 __all__ = [
     "DualAscent",
+    "HindsightLoss",
     "TFRMSprop",
     "USFEstimator",
     "USFLoss",
     "dual_ascent",
+    "expectile_loss",
     "explained_variance",
     "gaussian_kl",
     "information_bottleneck",
     "lambda_return",
     "n_step_return",
     "policy_gradient_loss",
+    "relabelled_target",
     "successor_loss",
     "successor_return",
+    "walked_return",
 ]

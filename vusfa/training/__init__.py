@@ -9,6 +9,7 @@ from vusfa.training.learning import annealed, descend, make_loss, make_optimiser
 from vusfa.training.loggers import make_loggers
 from vusfa.training.metrics import EpisodeMeter, MeanMeter
 from vusfa.training.progress import EvaluationProgress, ProgressLine
+from vusfa.training.replay import HindsightReplay, HindsightSampler
 from vusfa.training.session import (
     Session,
     load_agent,
@@ -18,15 +19,19 @@ from vusfa.training.session import (
     set_threads,
     torch_device,
 )
+from vusfa.training.setup import Training, make_training
 from vusfa.training.signals import StopOnSignal
 
 __all__ = [
     "EpisodeMeter",
     "EvaluationProgress",
+    "HindsightReplay",
+    "HindsightSampler",
     "MeanMeter",
     "ProgressLine",
     "Session",
     "StopOnSignal",
+    "Training",
     "annealed",
     "check_goals_dealt",
     "descend",
@@ -38,6 +43,7 @@ __all__ = [
     "make_loss",
     "make_observation",
     "make_optimiser",
+    "make_training",
     "rebuild_agent",
     "save_checkpoint",
     "scene_sources",

@@ -31,6 +31,7 @@ from vusfa.training.collectors import close_collector, collector_state, load_col
 from vusfa.training.learning import loss_state
 from vusfa.training.loggers import flat
 from vusfa.training.metrics import EpisodeMeter, MeanMeter
+from vusfa.training.replay import HindsightReplay
 
 __all__ = [
     "Session",
@@ -68,6 +69,7 @@ class Session:
         episodes: how the episodes since the last line of the log ended.
         terms: means of the loss's terms since then.
         run_id: the same for all loggers and for all resumptions.
+        replay: what the agent walked, where it learns from that, too.
     """
 
     scenes: SceneSet
@@ -80,6 +82,7 @@ class Session:
     updates: int = 0
     seconds: float = 0.0
     run_id: str = field(default_factory=lambda: secrets.token_hex(4))
+    replay: HindsightReplay | None = None
 
     def __post_init__(self) -> None:
         self.episodes = EpisodeMeter(self.scenes, self.goals)
@@ -179,6 +182,7 @@ class Session:
                 "optimiser": self.optimiser.state_dict(),
                 "collector": collector_state(self._collector),
                 "meter": {"episodes": self.episodes.state_dict(), "terms": self.terms.state_dict()},
+                "replay": None if self.replay is None else self.replay.state_dict(),
                 "rng": random_state(),
             },
         )
@@ -207,6 +211,10 @@ class Session:
         self.loss.load_state_dict(adapted, strict=False)
         self.episodes.load_state_dict(state["meter"]["episodes"])
         self.terms.load_state_dict(state["meter"]["terms"])
+        if self.replay is not None:
+            if not state.get("replay"):
+                raise CheckpointError(f"{path}: of a training without hindsight; give hindsight=none")
+            self.replay.load_state_dict(state["replay"])
         for name in ("frames", "updates", "seconds", "run_id"):
             setattr(self, name, state[name])
         self._waiting = {"collector": state["collector"], "rng": state["rng"]}

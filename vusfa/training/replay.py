@@ -1,0 +1,238 @@
+"""A replay buffer of what the agent walked, and goals for it in hindsight.
+
+TorchRL's :class:`~torchrl.data.HERReplayBuffer` keeps one episode after the other and names goals of the same
+episode. Here many environments walk at once and an episode is spread over many batches, half of the goals
+come from anywhere in the scene that the agent has been, and the steps to a goal are wanted, too: so only the
+sampler is ours; storage and buffer are TorchRL's.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
+from torchrl.data.replay_buffers import RandomSampler, Storage
+
+from vusfa.errors import ConfigError
+
+__all__ = ["HindsightReplay", "HindsightSampler", "steps_ahead"]
+
+
+def steps_ahead(clock: Tensor, row: Tensor, num_envs: int, horizon: int) -> Tensor:
+    """How many more of its steps each row's walk has on record, itself included.
+
+    Args:
+        clock: (N,) int64, time-major: row i + num_envs is the same environment's next step. The clock goes on
+            by one a step and leaves one number out where an episode ends.
+        row: (n,) int64, rows to start from.
+        num_envs: environments.
+        horizon: no more than these many.
+
+    Returns:
+        (n,) int64, 1 to ``horizon``.
+
+    >>> clock = torch.tensor([0, 0, 1, 2, 2, 3])  # two environments; the second's episode ends at once
+    >>> steps_ahead(clock, torch.tensor([0, 1, 3]), num_envs=2, horizon=5)
+    tensor([3, 1, 2])
+    """
+    ahead = torch.arange(horizon, device=clock.device)
+    later = clock[(row.unsqueeze(-1) + ahead * num_envs) % len(clock)]
+    on_record = later == clock[row].unsqueeze(-1) + ahead
+    return on_record.long().cumprod(-1).sum(-1)
+
+
+class HindsightSampler(RandomSampler):
+    """Draws transitions uniformly and a goal for each: one that the same walk reached a few steps later, or
+    any state of the scene that the agent has ever seen.
+
+    It adds ``goal_id``, int64, and ``steps_to_goal``, int64, 0 for a goal of the second kind. Rows come
+    sorted by scene and state, which is what per-scene layers are fastest with.
+
+    Args:
+        num_envs: environments; the storage is time-major, see :func:`steps_ahead`.
+        num_states: of the world; ids are below it.
+        horizon: the farthest goal of the first kind, in steps.
+        own_future: part of goals of the first kind.
+
+    >>> sampler = HindsightSampler(num_envs=1, num_states=9)
+    >>> sampler.see(torch.tensor([2, 5, 7, 2]), torch.tensor([0, 0, 1, 0]))
+    >>> sampler.seen.nonzero().squeeze(-1)
+    tensor([2, 5, 7])
+    """
+
+    def __init__(self, num_envs: int, num_states: int, horizon: int = 30, own_future: float = 0.5) -> None:
+        if num_envs < 1 or horizon < 1 or not 0 <= own_future <= 1:
+            raise ConfigError(
+                f"hindsight: num_envs is {num_envs}, horizon {horizon} and own_future {own_future}; give 1 or"
+                " more, 1 or more, and a number between 0 and 1"
+            )
+        super().__init__()
+        self.num_envs, self.horizon, self.own_future = num_envs, horizon, own_future
+        self.scene_of = torch.full((num_states,), -1)
+        self._tabulate()
+
+    @property
+    def seen(self) -> Tensor:
+        """(S,) bool: states that the agent has been in."""
+        return self.scene_of >= 0
+
+    def see(self, state: Tensor, scene: Tensor) -> None:
+        """The agent has been in these states, ids of any shape, of these scenes."""
+        self.scene_of = self.scene_of.to(state.device)
+        if not self.seen[state].all():
+            self.scene_of[state] = scene
+            self._tabulate()
+
+    def _tabulate(self) -> None:
+        """Seen states scene by scene: their ids, how many, and where each scene's begin."""
+        known = self.seen.nonzero().squeeze(-1)
+        scene = self.scene_of[known]
+        self._states = known[scene.argsort(stable=True)]
+        self._number = torch.bincount(scene)
+        self._first = self._number.cumsum(0) - self._number
+
+    def sample(self, storage: Storage, batch_size: int) -> tuple[Tensor, dict[str, Tensor]]:
+        """Rows of the storage, (batch_size,), and their goals."""
+        data = storage[:]
+        clock, state = data.get("clock"), data.get("state_id")[..., -1]
+        row = torch.randint(len(clock), (batch_size,), device=clock.device)
+        row = row[state[row].argsort()]
+        steps = steps_ahead(clock, row, self.num_envs, self.horizon)
+        steps = 1 + (torch.rand_like(steps, dtype=torch.float32) * steps).long()
+        last = (row + (steps - 1) * self.num_envs) % len(clock)
+        own = data.get(("next", "state_id"))[..., -1][last]
+        chosen = torch.rand_like(steps, dtype=torch.float32) < self.own_future
+        goal = torch.where(chosen, own, self.any_seen(data.get("scene_id")[row]))
+        return row, {"goal_id": goal, "steps_to_goal": torch.where(chosen, steps, 0)}
+
+    def any_seen(self, scene: Tensor) -> Tensor:
+        """One seen state of each of these scenes (n,), drawn uniformly."""
+        draw = torch.rand_like(scene, dtype=torch.float64) * self._number[scene]
+        return self._states[self._first[scene] + draw.long()]
+
+    def state_dict(self) -> dict[str, Any]:
+        """What it has seen."""
+        return {"scene_of": self.scene_of}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Put back what :meth:`state_dict` gave."""
+        self.scene_of = state_dict["scene_of"]
+        self._tabulate()
+
+
+class HindsightReplay:
+    """What the agent walked, fed from a collector's batches and read with goals named in hindsight.
+
+    Args:
+        num_states: of the world.
+        num_envs: environments whose batches come, always in the same order.
+        capacity: frames kept; rounded down to whole steps of all environments.
+        batch_size: transitions in a sample.
+        horizon, own_future: of :class:`HindsightSampler`.
+
+    Raises:
+        ConfigError: numbers that make no sense, or a capacity below one step of all environments.
+
+    >>> from vusfa.envs import TargetNavEnv
+    >>> from vusfa.scenes import SceneSet
+    >>> scenes = SceneSet.bundled(["bathroom"])
+    >>> replay = HindsightReplay(scenes.num_states, num_envs=8, capacity=1000, batch_size=5)
+    >>> replay.extend(TargetNavEnv(scenes, batch_size=[8], history=1).rollout(20, break_when_any_done=False))
+    >>> sorted(replay.sample().keys())
+    ['action', 'goal_id', 'next', 'scene_id', 'state_id', 'steps_to_goal']
+    """
+
+    def __init__(
+        self,
+        num_states: int,
+        num_envs: int,
+        *,
+        capacity: int = 1_000_000,
+        batch_size: int = 8192,
+        horizon: int = 30,
+        own_future: float = 0.5,
+    ) -> None:
+        if capacity < num_envs or batch_size < 1:
+            raise ConfigError(
+                f"hindsight: capacity is {capacity} and batch_size {batch_size}; give {num_envs} (a step of"
+                " every environment) or more, and 1 or more"
+            )
+        self.num_envs = num_envs
+        self.sampler = HindsightSampler(num_envs, num_states, horizon, own_future)
+        self.buffer = TensorDictReplayBuffer(
+            storage=LazyTensorStorage(capacity // num_envs * num_envs),
+            sampler=self.sampler,
+            batch_size=batch_size,
+        )
+        self._clock = torch.zeros(num_envs, dtype=torch.int64)
+
+    def __len__(self) -> int:
+        """Frames on record."""
+        return len(self.buffer)
+
+    def extend(self, batch: TensorDictBase) -> None:
+        """Takes in a collector's batch (num_envs, T), the continuation of the last one.
+
+        Raises:
+            ConfigError: a batch of other environments.
+        """
+        if batch.shape[0] != self.num_envs:
+            raise ConfigError(
+                f"hindsight: a batch of {batch.shape[0]} environments where {self.num_envs} were announced;"
+                " a collector that hands over some of its environments at a time (multi_async) cannot be used"
+            )
+        done = batch.get(("next", "done")).squeeze(-1).long()
+        skipped = done.cumsum(1) - done
+        clock = self._clock.to(done.device).unsqueeze(-1) + torch.arange(done.shape[1], device=done.device)
+        steps = TensorDict(
+            {
+                "state_id": batch.get("state_id"),
+                "scene_id": batch.get("scene_id"),
+                "action": batch.get("action"),
+                "clock": clock + skipped,
+                "next": TensorDict({"state_id": batch.get(("next", "state_id"))}, batch.shape),
+            },
+            batch.shape,
+        )
+        self._clock = clock[:, -1] + done.sum(1) + 1
+        rows = steps.transpose(0, 1).reshape(-1)
+        for ids in (rows.get("state_id"), rows.get(("next", "state_id"))):
+            self.sampler.see(ids[..., -1], rows.get("scene_id"))
+        self.buffer.extend(rows)
+
+    def sample(self) -> TensorDictBase:
+        """Transitions with ``goal_id`` and ``steps_to_goal``, (batch_size,)."""
+        return self.buffer.sample().exclude("index", "clock")
+
+    def state_dict(self) -> dict[str, Any]:
+        """What is on record, as tensors and plain data."""
+        rows = self.buffer[:].to_dict() if len(self) else {}
+        return {
+            "rows": rows,
+            "cursor": self.buffer.writer.state_dict()["_cursor"],
+            "clock": self._clock,
+            "sampler": self.sampler.state_dict(),
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Put back what :meth:`state_dict` gave, into a buffer of the same size.
+
+        Raises:
+            ConfigError: it is of another number of environments, or longer than the buffer.
+        """
+        capacity = self.buffer.storage.max_size
+        length = len(state["rows"]["clock"]) if state["rows"] else 0
+        if len(state["clock"]) != self.num_envs or length > capacity:
+            raise ConfigError(
+                f"hindsight: saved were {length} frames of {len(state['clock'])} environments, which do not"
+                f" fit {capacity} of {self.num_envs}; leave hindsight.capacity and collector.num_envs as they"
+                " were"
+            )
+        if length:
+            self.buffer.extend(TensorDict(state["rows"], [length]))
+            self.buffer.writer.load_state_dict({"_cursor": state["cursor"]})
+        self._clock = state["clock"]
+        self.sampler.load_state_dict(state["sampler"])
