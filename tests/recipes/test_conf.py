@@ -36,6 +36,7 @@ def test_the_groups_mirror_the_package():
         "collector",
         "env",
         "evaluation",
+        "hindsight",
         "logger",
         "objective",
         "optim",
