@@ -18,8 +18,8 @@ ENVS, LONG = 3, 40
 
 
 def walked(first: int, steps: int, ends: dict[int, set[int]]) -> TensorDict:
-    """Row r walks r*100, r*100+1, ... one state a step, times ``first`` to ``first + steps``; episodes of row r
-    end with the steps ``ends[r]``."""
+    """Row r walks r*100, r*100+1, ... one state a step, times ``first`` to ``first + steps``; episodes of row
+    r end with the steps ``ends[r]``."""
     time = torch.arange(first, first + steps).expand(ENVS, -1)
     state = time + 100 * torch.arange(ENVS).unsqueeze(-1)
     done = torch.tensor([[t in ends.get(r, ()) for t in range(first, first + steps)] for r in range(ENVS)])
@@ -52,7 +52,8 @@ def test_goals_of_the_own_way_lie_on_it(ends: dict[int, set[int]], capacity: int
     sample = filled(capacity, ends, horizon=horizon, own_future=1.0).sample()
     state, goal, steps = sample["state_id"][:, -1], sample["goal_id"], sample["steps_to_goal"]
     assert torch.equal(goal, state + steps)  # as this world is: one state a step, within one row's states
-    assert int(steps.min()) >= 1 and int(steps.max()) <= horizon
+    assert int(steps.min()) >= 1
+    assert int(steps.max()) <= horizon
     for s, k in set(zip(state.tolist(), steps.tolist(), strict=True)):
         row, time = divmod(s, 100)
         assert not ends.get(row, set()) & set(range(time, time + k - 1))  # no episode ends on the way
@@ -114,7 +115,7 @@ def test_a_saved_buffer_goes_on_as_the_first(capacity: int, tmp_path):
 
 def test_what_does_not_fit_is_refused():
     replay = filled(500, {})
-    with pytest.raises(ConfigError, match="leave hindsight.capacity"):
+    with pytest.raises(ConfigError, match=r"leave hindsight\.capacity"):
         HindsightReplay(400, ENVS, capacity=30).load_state_dict(replay.state_dict())
     with pytest.raises(ConfigError, match="2 environments where 3 were announced"):
         replay.extend(walked(0, 5, {})[:2])
