@@ -23,6 +23,7 @@ from vusfa.training import (
     StopOnSignal,
     make_loggers,
     make_training,
+    row_name,
     set_threads,
 )
 from vusfa.training.launch import launch
@@ -80,7 +81,7 @@ def train(cfg: DictConfig, overrides: list[str]) -> tuple[Session, Comparison | 
         if cfg.evaluation.goals and not stop.received:
             options = {**measured, "history": agent.config["history"], "observe": training.observation}
             with EvaluationProgress() as told:
-                policies = {agent.config["model"]: training.actor}
+                policies = {row_name(plain): training.actor}
                 result = compare(policies, scenes, wanted, trained=goals, progress=told, **options)
             result.save(checkpoint.with_name("evaluation"))
             loggers.log_table("evaluation", result.rows, session.frames)

@@ -18,7 +18,14 @@ import tyro
 from vusfa.errors import VusfaError
 from vusfa.evaluation import compare, print_summary
 from vusfa.evaluation.files import check_folder
-from vusfa.training import EvaluationProgress, load_agent, make_observation, rebuild_agent, set_threads
+from vusfa.training import (
+    EvaluationProgress,
+    load_agent,
+    make_observation,
+    rebuild_agent,
+    row_name,
+    set_threads,
+)
 
 
 def zero_shot(
@@ -56,7 +63,7 @@ def zero_shot(
     agent, scenes, state = load_agent(checkpoint, device=device)
     torch.manual_seed(seed)
     untrained = rebuild_agent(agent.config, scenes).to(device)
-    policies = {agent.config["model"]: agent, "untrained": untrained}
+    policies = {row_name(state["config"]): agent, "untrained": untrained}
     with EvaluationProgress() as progress:
         result = compare(
             {name: policy.get_policy_operator() for name, policy in policies.items()},

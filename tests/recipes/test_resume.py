@@ -41,8 +41,9 @@ def assert_equal(one, other, where: str = "") -> None:
         ["agent.model=gvf", "optim=tf_rmsprop"],
         ["agent.model=usfa", "agent=lstm", "env.goal_sampling=episode"],
         ["agent.model=sfdp", "autocast=true"],
+        ["agent.model=vusfa", "hindsight=replay", "hindsight.batch_size=16", "hindsight.updates=2"],
     ],
-    ids=["vusfa", "gvf", "lstm", "autocast"],
+    ids=["vusfa", "gvf", "lstm", "autocast", "hindsight"],
 )
 def test_resumed_equals_uninterrupted(
     recipe, settings, small, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, options: list[str]

@@ -19,7 +19,7 @@ from vusfa.training.session import (
     set_threads,
     torch_device,
 )
-from vusfa.training.setup import Training, make_training
+from vusfa.training.setup import Training, make_training, row_name
 from vusfa.training.signals import StopOnSignal
 
 __all__ = [
@@ -45,6 +45,7 @@ __all__ = [
     "make_optimiser",
     "make_training",
     "rebuild_agent",
+    "row_name",
     "save_checkpoint",
     "scene_sources",
     "set_threads",

@@ -12,6 +12,7 @@ The one part of this package that needs Hydra (extra ``recipes``). A recipe is a
 
 from __future__ import annotations
 
+import logging
 import os
 import re
 import sys
@@ -53,6 +54,8 @@ def launch(job: Callable[[DictConfig, list[str]], int], folder: Path, name: str)
     """
     # Hydra then raises its errors instead of printing them; nothing else changes.
     os.environ["HYDRA_FULL_ERROR"] = "1"
+    if "RL_LOGGING_LEVEL" not in os.environ:  # how TorchRL's log is asked for
+        logging.getLogger("torchrl").setLevel(logging.WARNING)
     codes: list[int] = []
 
     def guarded(cfg: DictConfig) -> None:

@@ -25,7 +25,7 @@ from vusfa.training.learning import annealed, descend, make_loss, make_optimiser
 from vusfa.training.replay import HindsightReplay
 from vusfa.training.session import Session, make_observation, scene_sources, torch_device
 
-__all__ = ["Hindsight", "Training", "make_hindsight", "make_training"]
+__all__ = ["Hindsight", "Training", "make_hindsight", "make_training", "row_name"]
 
 
 @dataclass
@@ -158,6 +158,18 @@ def make_training(
     )
     precision = partial(torch.autocast, device.type, torch.bfloat16, enabled=settings["autocast"])
     return Training(session, actor, observation, collector, precision, multiplier, hindsight, settings)
+
+
+def row_name(settings: Mapping[str, Any]) -> str:
+    """What a trained agent is called in tables: its model, and whether it learned with hindsight.
+
+    >>> row_name({"agent": {"model": "vusfa"}, "hindsight": {"updates": 10}})
+    'vusfa + hindsight'
+    >>> row_name({"agent": {"model": "gvf"}})  # from before there was hindsight
+    'gvf'
+    """
+    updates = settings.get("hindsight", {}).get("updates", 0)
+    return f"{settings['agent']['model']} + hindsight" if updates else settings["agent"]["model"]
 
 
 def make_hindsight(settings: Mapping[str, Any], agent: Agent, scenes: SceneSet) -> Hindsight | None:

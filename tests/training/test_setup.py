@@ -1,0 +1,93 @@
+"""Settings become a training; hindsight takes its steps besides."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from omegaconf import OmegaConf
+
+from vusfa.errors import ConfigError
+from vusfa.training import Training, make_training
+from vusfa.training.launch import compose
+
+CONF = Path(__file__).parents[2] / "recipes" / "conf"
+SMALL = [
+    "env.goals=[3,9,12]",
+    "agent.hidden_size=8",
+    "agent.embedding_size=8",
+    "agent.history=1",
+    "collector.num_envs=6",
+    "collector.rollout=4",
+]
+HINDSIGHT = ["hindsight=replay", "hindsight.batch_size=16", "hindsight.updates=3"]
+
+
+def made(scene_file: Path, *overrides: str) -> Training:
+    cfg = compose(CONF, "train", [f"scenes=[{scene_file}]", *SMALL, *overrides])
+    settings: Any = OmegaConf.to_container(cfg, resolve=True)
+    return make_training(settings)
+
+
+def steps_taken(training: Training) -> int:
+    states = training.session.optimiser.state_dict()["state"]
+    return max(int(state["step"]) for state in states.values())
+
+
+def run(training: Training, updates: int) -> dict[str, torch.Tensor]:
+    with training.session.collecting(training.make_collector) as batches:
+        for _ in range(updates):
+            batch, terms = training.update(batches)
+            assert batch.shape == (6, 4)
+            training.session.count(batch, terms, 1.0)
+    return terms
+
+
+def test_without_hindsight_one_step_a_batch(scene_file: Path):
+    training = made(scene_file)
+    terms = run(training, 4)
+    assert training.hindsight is None
+    assert steps_taken(training) == 4
+    assert "loss_hindsight_critic" not in terms
+
+
+def test_hindsight_steps_as_often_as_asked(scene_file: Path):
+    training = made(scene_file, *HINDSIGHT)
+    terms = run(training, 4)
+    assert training.hindsight is not None
+    assert steps_taken(training) == 12
+    assert len(training.hindsight.replay) == 4 * 6 * 4
+    assert math.isfinite(terms["loss_hindsight_critic"].item())
+
+
+@pytest.mark.parametrize("updates", [0, 3])
+def test_entropy_and_rate_follow_the_frames(scene_file: Path, updates: int):
+    extra = [*HINDSIGHT, f"hindsight.updates={updates}"]
+    training = made(
+        scene_file,
+        *extra,
+        "optim.lr=0.01",
+        "optim.horizon=48",
+        "entropy.start=1.0",
+        "entropy.horizon=48",
+        "entropy.end=0.0",
+    )
+    run(training, 2)  # the second update begins at 24 of 48 frames
+    assert training.session.loss.entropy_coeff == pytest.approx(0.5)
+    assert float(training.session.optimiser.param_groups[0]["lr"]) == pytest.approx(0.005)
+
+
+@pytest.mark.parametrize(
+    ("overrides", "words"),
+    [
+        (["agent.memory=lstm"], "has no memory"),
+        (["collector=multi_async"], "no fixed order"),
+        (["hindsight.temperature=0"], "hindsight: "),
+    ],
+)
+def test_what_hindsight_cannot_do_is_said(scene_file: Path, overrides: list[str], words: str):
+    with pytest.raises(ConfigError, match=words):
+        made(scene_file, *HINDSIGHT, *overrides)
