@@ -3,8 +3,8 @@
 A goal set is written down in one of these forms, everywhere that goals can be given:
 
 =================  =======================================================================================
-``"paper"``        the paper's 20 in the paper's scenes (``manifests/paper.yaml``); five in any other scene, the
-                   bundled rooms among them, chosen by :func:`spread_goals`
+``"paper"``        the paper's 20 in the paper's scenes (``manifests/paper.yaml``); five in any other scene,
+                   the bundled rooms among them, chosen by :func:`spread_goals`
 ``"all"``          every state that some other state can reach
 ``"random:5"``     that many such states of each scene, drawn once and for all; "random:5:1" is another draw
 ``"my.yaml"``      a manifest: the names of scenes, each with a list of state ids within the scene
