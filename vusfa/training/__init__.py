@@ -5,6 +5,7 @@
 
 from vusfa.training.checkpoint import load_checkpoint, save_checkpoint
 from vusfa.training.collectors import check_goals_dealt, make_collector, make_env
+from vusfa.training.facts import machine_facts, run_facts
 from vusfa.training.learning import annealed, descend, make_loss, make_optimiser, total_loss
 from vusfa.training.loggers import make_loggers
 from vusfa.training.metrics import EpisodeMeter, MeanMeter
@@ -37,6 +38,7 @@ __all__ = [
     "descend",
     "load_agent",
     "load_checkpoint",
+    "machine_facts",
     "make_collector",
     "make_env",
     "make_loggers",
@@ -46,6 +48,7 @@ __all__ = [
     "make_training",
     "rebuild_agent",
     "row_name",
+    "run_facts",
     "save_checkpoint",
     "scene_sources",
     "set_threads",

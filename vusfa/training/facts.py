@@ -1,0 +1,63 @@
+"""What a training was, in plain data, for whoever keeps its results."""
+
+from __future__ import annotations
+
+import os
+import platform
+from collections.abc import Mapping, Sequence
+from importlib.metadata import version
+from typing import Any
+
+import torch
+
+from vusfa.training.setup import row_name
+
+__all__ = ["machine_facts", "run_facts"]
+
+
+def machine_facts() -> dict[str, Any]:
+    """Processor, cores, Python and the versions of the libraries that compute.
+
+    >>> sorted(machine_facts())
+    ['cores', 'gpu', 'processor', 'python', 'versions']
+    """
+    return {
+        "processor": _processor(),
+        "cores": os.cpu_count(),
+        "gpu": torch.cuda.get_device_name() if torch.cuda.is_available() else None,
+        "python": platform.python_version(),
+        "versions": {name: version(name) for name in ("vusfa", "torch", "torchrl", "tensordict")},
+    }
+
+
+def run_facts(state: Mapping[str, Any], overrides: Sequence[str] = ()) -> dict[str, Any]:
+    """Of a checkpoint: model, seed, settings, goals, frames and seconds; and the machine that asks.
+
+    Args:
+        state: as :func:`~vusfa.training.load_agent` returns it.
+        overrides: settings that the command gave.
+    """
+    config = state["config"]
+    return {
+        "model": config["agent"]["model"],
+        "agent_preset": config["agent"]["preset"],
+        "row": row_name(config),
+        "seed": config["seed"],
+        "overrides": list(overrides),
+        "scenes": list(state["scenes"]["names"]),
+        "scenes_fingerprint": state["scenes"]["fingerprint"],
+        "trained_goals": state["goals"].tolist(),
+        "frames": int(state["frames"]),
+        "updates": int(state["updates"]),
+        "training_s": round(float(state["seconds"]), 1),
+        "threads": config["threads"],
+        **machine_facts(),
+    }
+
+
+def _processor() -> str:
+    try:
+        with open("/proc/cpuinfo", encoding="utf-8") as lines:
+            return next(line.partition(":")[2].strip() for line in lines if line.startswith("model name"))
+    except (OSError, StopIteration):
+        return platform.processor() or platform.machine()
