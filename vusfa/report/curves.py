@@ -33,7 +33,7 @@ def curve_names(runs: Sequence[Run]) -> list[str]:
     """Columns of metrics.csv that the page draws: the general ones that any run logged, and the scenes'.
 
     >>> from pathlib import Path
-    >>> log = {"frames": np.ones(1), "success": np.ones(1), "scene/hall/success": np.ones(1), "lr": np.ones(1)}
+    >>> log = dict.fromkeys(["frames", "success", "scene/hall/success", "lr"], np.ones(1))
     >>> curve_names([Run("gvf", 0, Path(), {}, log)])
     ['success', 'scene/hall/success']
     """

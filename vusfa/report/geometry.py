@@ -26,7 +26,7 @@ def slices(location: np.ndarray, rotation: np.ndarray) -> tuple[np.ndarray, np.n
         rotation: (N,) degrees, 0 = up, 90 = right.
 
     Returns:
-        centre of the square (N, 2) metres; first and last angle of the slice, (N,) degrees each, last > first.
+        centre of the square (N, 2) metres; first and last angle of the slice, (N,) degrees each.
 
     >>> centre, first, last = slices(np.zeros((2, 2)), np.array([0.0, 90.0]))
     >>> first.tolist(), last.tolist()

@@ -13,7 +13,16 @@ from vusfa.evaluation.metrics import length_ratio, spl, success_rate
 from vusfa.report.runs import Run
 from vusfa.scenes import SceneSet
 
-__all__ = ["MEASURES", "distance_rows", "goal_rows", "measures", "over_seeds", "run_rows", "summary_rows"]
+__all__ = [
+    "MEASURES",
+    "distance_rows",
+    "goal_rows",
+    "measures",
+    "over_seeds",
+    "run_rows",
+    "seed_rows",
+    "summary_rows",
+]
 
 Row = dict[str, Any]
 
@@ -52,6 +61,21 @@ def over_seeds(rows: Sequence[Mapping[str, Any]], names: Sequence[str]) -> Row:
     return result
 
 
+def seed_rows(runs: Sequence[Run], within: Sequence[int] = (500, 100)) -> list[Row]:
+    """One row for each run, set of goals and scene: :func:`vusfa.evaluation.summary` with the seed beside it.
+
+    Args:
+        runs: those without an evaluation are left out.
+        within: numbers of actions to give the success for.
+    """
+    return [
+        {"model": run.label, "seed": run.seed} | {key: row[key] for key in row if key != "policy"}
+        for run in runs
+        if run.episodes is not None
+        for row in summary(run.episodes, run.label, within)
+    ]
+
+
 def summary_rows(runs: Sequence[Run], within: Sequence[int] = (500, 100)) -> list[Row]:
     """One row for each model, set of goals and scene; then the policies that the runs stand beside.
 
@@ -63,11 +87,11 @@ def summary_rows(runs: Sequence[Run], within: Sequence[int] = (500, 100)) -> lis
         rows with model, kind ("model" or "reference"), goals, scene, seeds, num_goals and num_episodes (of
         one seed), and mean, ``_low`` and ``_high`` over the seeds of every measure.
     """
-    single = [(run, row) for run in runs if run.episodes for row in summary(run.episodes, run.label, within)]
-    names = measures(row for _, row in single)
+    single = seed_rows(runs, within)
+    names = measures(single)
     groups: dict[tuple[str, str, str], list[Row]] = {}
-    for run, row in single:
-        groups.setdefault((run.label, row["goals"], row["scene"]), []).append(row)
+    for row in single:
+        groups.setdefault((row["model"], row["goals"], row["scene"]), []).append(row)
     rows = [
         {"model": label, "kind": "model", "goals": goals, "scene": scene, "seeds": len(group)}
         | {key: group[0][key] for key in ("num_goals", "num_episodes")}
@@ -75,9 +99,8 @@ def summary_rows(runs: Sequence[Run], within: Sequence[int] = (500, 100)) -> lis
         for (label, goals, scene), group in groups.items()
     ]
     beside: dict[tuple[str, str, str], Row] = {}
-    for run in runs:
-        for row in run.references:
-            beside.setdefault((row["policy"], row["goals"], row["scene"]), dict(row))
+    for reference in (row for run in runs for row in run.references):
+        beside.setdefault((reference["policy"], reference["goals"], reference["scene"]), dict(reference))
     for (policy, goals, scene), row in beside.items():
         head = {"model": policy, "kind": "reference", "goals": goals, "scene": scene, "seeds": math.nan}
         counts = {key: row.get(key, math.nan) for key in ("num_goals", "num_episodes")}
@@ -141,8 +164,8 @@ def distance_rows(runs: Sequence[Run], scenes: SceneSet, within: Sequence[int] =
         within: numbers of actions to give the success for.
 
     Returns:
-        rows with model, distance (words, such as "3–4"), from and to (actions from the nearest trained goal to
-        this one, inclusive), seeds, num_goals (of the first seed), and ``success_k`` and spl over the
+        rows with model, distance (words, such as "3–4"), from and to (actions from the nearest trained goal
+        to this one, inclusive), seeds, num_goals (of the first seed), and ``success_k`` and spl over the
         seeds, with ``_low`` and ``_high``.
     """
     groups: dict[tuple[str, int], list[Row]] = {}
