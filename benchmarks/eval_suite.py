@@ -9,7 +9,7 @@ import torch
 from benchmarks.report import Options, Report, Requirement, Row
 from vusfa.envs import resolve_goals
 from vusfa.evaluation import evaluate
-from vusfa.modules import make_agent
+from vusfa.modules import ActingPolicy, make_agent
 from vusfa.scenes import SceneSet
 
 __all__ = ["run"]
@@ -24,7 +24,7 @@ def run(options: Options) -> Report:
     torch.manual_seed(0)
     torch.set_num_threads(options.threads)
     agent = make_agent("vusfa", scenes=scenes, hidden_size=size, embedding_size=size)
-    actor = agent.get_policy_operator()
+    actor = ActingPolicy(agent)
     goals = resolve_goals(scenes, "all")
     each, limit = (1, 10) if options.quick else (10, 500)
     chosen = goals[:8] if options.quick else goals

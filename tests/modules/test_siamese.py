@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+from contextlib import nullcontext
 from typing import Any
 
 import pytest
@@ -181,7 +182,9 @@ def test_normalised_embeddings(scenes: SceneSet) -> None:
     given = torch.tensor([2.0, 4.0, 6.0, 8.0])
 
     class Encoder:
-        def both(self, state: torch.Tensor, goal: torch.Tensor, heads: Any) -> tuple[Any, Any]:
+        def both(
+            self, state: torch.Tensor, goal: torch.Tensor, heads: Any, part: int | None
+        ) -> tuple[Any, Any]:
             return heads[0](state), heads[1](goal)
 
     state, goal = NormalisedEncoder(Encoder())(given, 100 * given)
@@ -239,6 +242,34 @@ class TestFrozen:
         torch.testing.assert_close(gradients[0], gradients[1], atol=1e-4, rtol=1e-4)
         if history == 1:
             assert counter.get_total_flops() == 0
+
+    @pytest.mark.parametrize("history", [1, 4])
+    @pytest.mark.parametrize("quirk", QUIRKS, ids=str)
+    def test_only_the_goals_that_there_are(
+        self, scenes: SceneSet, history: int, quirk: dict[str, Any]
+    ) -> None:
+        module = encoder(scenes, history, **quirk)
+        states, _ = ids(scenes, 2, 5, history=history)
+        goals = torch.tensor([7, 2, 11])
+        chosen = goals[torch.randint(3, (2, 5))]
+        wanted = module(states, chosen)
+        with frozen(module, goals=goals), torch.no_grad():
+            torch.testing.assert_close(module(states, chosen), wanted)
+            with pytest.raises(IndexError):
+                module(states, torch.full((2, 5), 3))
+
+    @pytest.mark.parametrize("history", [1, 4])
+    def test_one_part_of_what_the_heads_return(self, scenes: SceneSet, history: int) -> None:
+        def head(code: torch.Tensor) -> tuple[torch.Tensor, ...]:
+            return code + 1, code * 2
+
+        module, inputs = encoder(scenes, history), ids(scenes, 60, history=history)
+        for some in (inputs, tuple(part[:3] for part in inputs)):
+            for context in (nullcontext(), frozen(module)):
+                with context, torch.no_grad():
+                    state, goal = module(*some)
+                    twice = module.both(*some, (head, head), 1)
+                torch.testing.assert_close(twice, (2 * state, 2 * goal))
 
     def test_an_agent_fed_features_has_nothing_to_freeze(self, scenes: SceneSet) -> None:
         module = SiameseEncoder(FeatureFrames(scenes.features, lookup=False), 4, 16, 8, by_id=False)

@@ -7,6 +7,7 @@
 'state_value'
 """
 
+from vusfa.modules.acting import ActingPolicy, action_logits, draw_actions
 from vusfa.modules.agents import Agent, make_agent
 from vusfa.modules.bottleneck import GaussianEncoder, LatentSampler
 from vusfa.modules.frames import FeatureFrames, PictureFrames
@@ -20,6 +21,7 @@ from vusfa.modules.trunk import Fusion, SceneLayer
 __all__ = [
     "MODELS",
     "PRESETS",
+    "ActingPolicy",
     "Agent",
     "AgentConfig",
     "FeatureFrames",
@@ -38,6 +40,8 @@ __all__ = [
     "SuccessorPolicyHead",
     "SuccessorValue",
     "ValueHead",
+    "action_logits",
+    "draw_actions",
     "frozen",
     "make_agent",
     "resolve_config",

@@ -69,11 +69,10 @@ class GaussianEncoder(nn.Module):
         the KL (\\*B, 1)."""
         return interleaved(*self.both(state, goal, (as_it_is, as_it_is)))
 
-    def both(self, state: Tensor, goal: Tensor, heads: Heads) -> tuple[Any, Any]:
-        """What the heads make of the means; then mean, scale and KL."""
-        return self.encoder.both(
-            state, goal, (_Gaussian(self.scale, heads[0]), _Gaussian(self.scale, heads[1]))
-        )
+    def both(self, state: Tensor, goal: Tensor, heads: Heads, part: int | None = None) -> tuple[Any, Any]:
+        """What the heads make of the means; then mean, scale and KL; or one part of all these."""
+        gaussian = _Gaussian(self.scale, heads[0]), _Gaussian(self.scale, heads[1])
+        return self.encoder.both(state, goal, gaussian, part)
 
 
 class _Gaussian(NamedTuple):

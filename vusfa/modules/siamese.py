@@ -93,7 +93,7 @@ class SiameseEncoder(nn.Module):
         super().__init__()
         self.history = history
         self.by_id = by_id
-        self._frozen: tuple[Tensor, Tensor] | None = None
+        self._frozen: tuple[Tensor, Tensor, Tensor | None] | None = None
         self._frozen_heads: dict[Heads, tuple[Any, Any]] = {}
         self.frames = frames
         self.branch = Branch(history, frames.size, hidden_size, out_features)
@@ -104,12 +104,13 @@ class SiameseEncoder(nn.Module):
         """Codes of state and goal, (\\*B, out) each, float32."""
         return self.both(state, goal, (as_it_is, as_it_is))
 
-    def both(self, state: Tensor, goal: Tensor, heads: Heads) -> tuple[Any, Any]:
-        """What the two heads make of the codes of state and goal, (\\*B, ...) each."""
+    def both(self, state: Tensor, goal: Tensor, heads: Heads, part: int | None = None) -> tuple[Any, Any]:
+        """What the two heads make of the codes of state and goal, (\\*B, ...) each; of tuples that they
+        return, one part alone if it is named."""
         if self.by_id:
-            return self.from_ids(state, goal, heads)
+            return self.from_ids(state, goal, heads, part)
         codes = self.from_observations(state, goal)
-        return heads[0](codes[0].float()), heads[1](codes[1].float())
+        return _part(heads[0](codes[0].float()), part), _part(heads[1](codes[1].float()), part)
 
     def from_observations(self, observation: Tensor, goal_observation: Tensor) -> tuple[Tensor, Tensor]:
         """Codes of observations: every frame of every row is encoded.
@@ -138,13 +139,16 @@ class SiameseEncoder(nn.Module):
         history = frames.narrow(place, frames.size(place) - self.history, self.history)
         return branch.first(self.frames.encode(history))
 
-    def from_ids(self, state_id: Tensor, goal_id: Tensor, heads: Heads | None = None) -> tuple[Any, Any]:
+    def from_ids(
+        self, state_id: Tensor, goal_id: Tensor, heads: Heads | None = None, part: int | None = None
+    ) -> tuple[Any, Any]:
         """Codes of states by id: each distinct state of the batch is encoded once.
 
         Args:
             state_id: (\\*B, H) int64, oldest first. Of a longer history the last H frames are read.
             goal_id: (\\*B,) int64.
             heads: of state and goal; they run on distinct codes where those are fewer than the rows.
+            part: index of the one tensor that is wanted of those that the heads return; None for all.
 
         Returns:
             codes of state and goal, (\\*B, out) each, float32; or what the heads make of them.
@@ -156,36 +160,39 @@ class SiameseEncoder(nn.Module):
         states, goals = state_id[..., -self.history :].reshape(-1, self.history), goal_id.reshape(-1)
         heads = heads or (as_it_is, as_it_is)
         if self._frozen is not None and (self._frozen[0].requires_grad or not torch.is_grad_enabled()):
-            state, goal = self._from_frozen(states, goals, heads)
+            state, goal = self._from_frozen(states, goals, heads, part)
         else:
-            state, goal = self._from_distinct(states, goals, heads)
+            state, goal = self._from_distinct(states, goals, heads, part)
         shape = goal_id.shape
         return _map(state, lambda rows: rows.view(*shape, -1)), _map(goal, lambda rows: rows.view(*shape, -1))
 
-    def _from_distinct(self, states: Tensor, goals: Tensor, heads: Heads) -> tuple[Any, Any]:
+    def _from_distinct(
+        self, states: Tensor, goals: Tensor, heads: Heads, part: int | None
+    ) -> tuple[Any, Any]:
         features, state_row, goal_row = self._distinct_features(states, goals)
         goal_row, goal_index = torch.unique(goal_row, return_inverse=True)
         first = self.branch.first
         if self.history == 1:
             each = first(features.unsqueeze(-2))
             distinct = heads[0](self.branch.finish(each, self.state_layer).float())
-            state = _lookup(distinct, state_row.squeeze(-1))
+            state = _lookup(_part(distinct, part), state_row.squeeze(-1))
             goal_first = functional.embedding(goal_row, each)
         elif len(features) <= len(states):
             projected = first.project(features)
             code = self.branch.finish(first.gather(projected, state_row), self.state_layer)
-            state = heads[0](code.float())
+            state = _part(heads[0](code.float()), part)
             goal_first = first.gather(projected, goal_row.unsqueeze(-1).expand(-1, self.history))
         else:
             # Fewer rows than distinct frames: every frame with every place's weight would be the longer way.
             histories = functional.embedding(state_row, features)
-            state = heads[0](self.branch.finish(first(histories), self.state_layer).float())
+            state = _part(heads[0](self.branch.finish(first(histories), self.state_layer).float()), part)
             goal_first = first.repeated(functional.embedding(goal_row, features))
         goal_branch = self.branch
         if self.goal_branch is not None:
             goal_branch = self.goal_branch
             goal_first = goal_branch.first.repeated(functional.embedding(goal_row, features))
-        return state, _lookup(heads[1](goal_branch.finish(goal_first).float()), goal_index)
+        of_goal = heads[1](goal_branch.finish(goal_first).float())
+        return state, _lookup(_part(of_goal, part), goal_index)
 
     def _distinct_features(self, states: Tensor, goals: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Features (D, F) of the batch's distinct states, and each id's row in them: (R, H) and (R,).
@@ -197,9 +204,9 @@ class SiameseEncoder(nn.Module):
         distinct, row = torch.unique(torch.cat([states.flatten(), goals]), return_inverse=True)
         return self.frames.lookup(distinct), row[: states.numel()].view_as(states), row[states.numel() :]
 
-    def _from_frozen(self, states: Tensor, goals: Tensor, heads: Heads) -> tuple[Any, Any]:
+    def _from_frozen(self, states: Tensor, goals: Tensor, heads: Heads, part: int | None) -> tuple[Any, Any]:
         assert self._frozen is not None
-        state_part, goal_codes = self._frozen
+        state_part, goal_codes, goal_row = self._frozen
         one = self.history == 1
         if heads not in self._frozen_heads:
             # with gradients wherever the codes have them: collecting comes first, and has none
@@ -207,13 +214,13 @@ class SiameseEncoder(nn.Module):
                 tables = heads[0](state_part) if one else None, heads[1](goal_codes)
             self._frozen_heads[heads] = tables
         state_table, goal_table = self._frozen_heads[heads]
-        goal = _lookup(goal_table, goals)
+        goal = _lookup(_part(goal_table, part), goals if goal_row is None else goal_row[goals])
         if one:
-            return _lookup(state_table, states.squeeze(-1)), goal
+            return _lookup(_part(state_table, part), states.squeeze(-1)), goal
         code = self.branch.finish(self.branch.first.gather(state_part, states), self.state_layer)
-        return heads[0](code.float()), goal
+        return _part(heads[0](code.float()), part), goal
 
-    def freeze(self, grad: bool = False) -> None:
+    def freeze(self, grad: bool = False, goals: Tensor | None = None) -> None:
         """Encodes all states of the world now; calls until :meth:`thaw` look them up. See :func:`frozen`."""
         if not self.by_id:
             return
@@ -223,9 +230,14 @@ class SiameseEncoder(nn.Module):
                 state_part = self.branch.finish(first(features.unsqueeze(-2)), self.state_layer).float()
             else:
                 state_part = first.project(features)
-            goal_branch = self.goal_branch or self.branch
+            goal_branch, row = self.goal_branch or self.branch, None
+            if goals is not None:
+                # -1 where a state is no goal: looking it up fails, and does not mistake it for another one
+                row = torch.full((len(features),), -1, dtype=torch.int64, device=features.device)
+                row[goals] = torch.arange(len(goals), device=features.device)
+                features = features[goals]
             goal_codes = goal_branch.finish(goal_branch.first.repeated(features)).float()
-        self._frozen = state_part, goal_codes
+        self._frozen = state_part, goal_codes, row
 
     def thaw(self) -> None:
         """Encodes with the weights as they are again."""
@@ -266,9 +278,9 @@ class NormalisedEncoder(nn.Module):
         """Both embeddings, and what else the encoder returns."""
         return interleaved(*self.both(state, goal, (as_it_is, as_it_is)))
 
-    def both(self, state: Tensor, goal: Tensor, heads: Heads) -> tuple[Any, Any]:
-        """What the heads make of the normalised embeddings, and what else the encoder returns."""
-        return self.encoder.both(state, goal, (_Normalised(heads[0]), _Normalised(heads[1])))
+    def both(self, state: Tensor, goal: Tensor, heads: Heads, part: int | None = None) -> tuple[Any, Any]:
+        """What the heads make of the normalised embeddings, and what else it returns; or one part."""
+        return self.encoder.both(state, goal, (_Normalised(heads[0]), _Normalised(heads[1])), part)
 
 
 class _Normalised(NamedTuple):
@@ -304,12 +316,16 @@ def _map(parts: Any, function: Callable[[Tensor], Tensor]) -> Any:
     )
 
 
+def _part(made: Any, part: int | None) -> Any:
+    return made if part is None else made[part]
+
+
 def _lookup(table: Any, index: Tensor) -> Any:
     return _map(table, lambda part: functional.embedding(index, part))
 
 
 @contextmanager
-def frozen(module: nn.Module, grad: bool = False) -> Iterator[None]:
+def frozen(module: nn.Module, grad: bool = False, goals: Tensor | None = None) -> Iterator[None]:
     """Within it, every siamese encoder in ``module`` looks up what it encoded on the way in, and scenes'
     weights are converted for autocast once.
 
@@ -320,6 +336,8 @@ def frozen(module: nn.Module, grad: bool = False) -> Iterator[None]:
         grad: what is looked up carries gradients to the weights, where gradients are on: for an update, which
             then encodes the world once for collecting and for the loss. Otherwise calls with gradients encode
             anew.
+        goals: (G,) ids of the only states that will be goals, which are then the only ones to be encoded as
+            such; None for all of the world.
 
     >>> from vusfa.modules import make_agent
     >>> from vusfa.scenes import SceneSet
@@ -330,7 +348,7 @@ def frozen(module: nn.Module, grad: bool = False) -> Iterator[None]:
     parts = [part for part in module.modules() if isinstance(part, SiameseEncoder | SceneLinear)]
     try:
         for part in parts:
-            part.freeze(grad)
+            part.freeze(grad, goals) if isinstance(part, SiameseEncoder) else part.freeze(grad)
         yield
     finally:
         for part in parts:

@@ -69,11 +69,18 @@ class SiameseTrunk(nn.Module):
 
     def forward(self, state: Tensor, goal: Tensor) -> tuple[Tensor, ...]:
         """Embeddings of state and goal, what else the encoder returns, and last the fused (\\*B, hidden)."""
-        heads = _Fused(self.fusion, "state_part"), _Fused(self.fusion, "goal_part")
-        of_state, of_goal = self.encoder.both(state, goal, heads)
+        of_state, of_goal = self.encoder.both(state, goal, self._heads())
         (state_embedding, state_part, *rest), (goal_embedding, goal_part, *goal_rest) = of_state, of_goal
         fused = functional.relu(state_part + goal_part)
         return state_embedding, goal_embedding, *rest, *goal_rest, fused
+
+    def fused(self, state: Tensor, goal: Tensor) -> Tensor:
+        """The fused (\\*B, hidden) alone; nothing else is looked up."""
+        state_part, goal_part = self.encoder.both(state, goal, self._heads(), 1)
+        return functional.relu(state_part + goal_part)
+
+    def _heads(self) -> tuple[_Fused, _Fused]:
+        return _Fused(self.fusion, "state_part"), _Fused(self.fusion, "goal_part")
 
 
 class _Fused(NamedTuple):

@@ -143,7 +143,9 @@ def make_collector(
     # worker's.
     env = make_env(batch_size=[rows], first_goal=0, seed=seed)
     if kind == "single":
-        return Collector(env, policy, frames_per_batch=rows * rollout, track_traj_ids=False, **shared)
+        # Told where everything is, the collector does not copy each step to see that it is there.
+        shared |= {"device": env.device, "track_traj_ids": False}
+        return Collector(env, policy, frames_per_batch=rows * rollout, **shared)
     makers = [
         partial(make_env, batch_size=[rows], first_goal=worker * rows, seed=seed + worker)
         for worker in range(num_workers)

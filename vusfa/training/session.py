@@ -125,11 +125,12 @@ class Session:
             precision: context to encode in, such as autocast.
         """
         collector = self._collector
+        goals = self.goals if self.replay is None else None  # hindsight: any state may be a goal
         frames = collector.requested_frames_per_batch if isinstance(collector, Collector) else 0
         with ExitStack() as stack:
             if 2 * frames >= self.scenes.num_states:
                 with precision():
-                    stack.enter_context(frozen(self.agent, grad=True))
+                    stack.enter_context(frozen(self.agent, grad=True, goals=goals))
             yield
 
     def count(self, batch: TensorDictBase, terms: Mapping[str, Tensor], seconds: float) -> None:

@@ -16,7 +16,7 @@ from torchrl.collectors import BaseCollector
 
 from vusfa.envs import SceneObservation, resolve_goals
 from vusfa.errors import ConfigError
-from vusfa.modules import Agent, frozen, make_agent
+from vusfa.modules import ActingPolicy, Agent, frozen, make_agent
 from vusfa.objectives import DualAscent
 from vusfa.objectives.hindsight import HindsightLoss
 from vusfa.scenes import SceneSet
@@ -151,7 +151,7 @@ def make_training(
     collector = partial(
         make_collector,
         make_env=env,
-        policy=actor,
+        policy=actor if agent.memory is not None else ActingPolicy(agent),
         seed=settings["seed"],
         autocast=settings["autocast"],
         **settings["collector"],

@@ -1,0 +1,88 @@
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import pytest
+import torch
+from tensordict import TensorDict
+from tensordict.nn import InteractionType
+from torch.distributions import Categorical
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+
+from vusfa.modules import MODELS, PRESETS, ActingPolicy, Agent, action_logits, draw_actions, frozen
+
+MakeAgent = Callable[..., Agent]
+MakeBatch = Callable[..., TensorDict]
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+@pytest.mark.parametrize("model", MODELS)
+class TestBesideTheActor:
+    @pytest.mark.parametrize("batch", [(), (3,), (2, 5), (60,)])
+    def test_the_same_draws_of_the_same_logits(
+        self, small_agent: MakeAgent, make_batch: MakeBatch, model: str, preset: str, batch: tuple[int, ...]
+    ) -> None:
+        agent, data = small_agent(model, preset), make_batch(*batch)
+        actions = []
+        for policy in (agent.get_policy_operator(), ActingPolicy(agent)):
+            torch.manual_seed(3)
+            actions.append(policy(data.clone())["action"])
+        assert actions[0].shape == batch
+        assert torch.equal(*actions)
+
+    @pytest.mark.parametrize("history", [1, 4])
+    def test_logits(
+        self, small_agent: MakeAgent, make_batch: MakeBatch, model: str, preset: str, history: int
+    ) -> None:
+        agent, data = small_agent(model, preset, history=history), make_batch(40)
+        wanted = agent.get_policy_operator().get_dist_params(data.clone())["logits"]
+        rows = data["state_id"], data["goal_id"], data["scene_id"]
+        torch.testing.assert_close(action_logits(agent, *rows), wanted, atol=1e-5, rtol=1e-5)
+        with torch.no_grad(), frozen(agent):
+            torch.testing.assert_close(action_logits(agent, *rows), wanted, atol=1e-5, rtol=1e-5)
+
+
+def test_it_writes_the_action_alone(small_agent: MakeAgent, make_batch: MakeBatch) -> None:
+    data = make_batch(4, 3)
+    before = set(data.keys())
+    assert set(ActingPolicy(small_agent("vusfa"))(data).keys()) - before == {"action"}
+
+
+def test_the_likeliest_action_when_that_is_asked_for(small_agent: MakeAgent, make_batch: MakeBatch) -> None:
+    agent, data = small_agent("vusfa"), make_batch(50)
+    wanted = agent.get_policy_operator().get_dist_params(data.clone())["logits"].argmax(-1)
+    with set_exploration_type(ExplorationType.DETERMINISTIC):
+        assert torch.equal(ActingPolicy(agent)(data)["action"], wanted)
+
+
+def test_weights_are_the_agents_own(small_agent: MakeAgent, make_batch: MakeBatch) -> None:
+    agent, data = small_agent("gvf"), make_batch(200)
+    policy = ActingPolicy(agent)
+    policy(data)
+    with torch.no_grad():
+        agent.policy.linear.bias.zero_()[:, 2] = 1e6
+    assert bool((policy(data)["action"] == 2).all())
+
+
+def test_an_agent_with_a_memory_is_refused(small_agent: MakeAgent) -> None:
+    with pytest.raises(ValueError, match="get_policy_operator"):
+        ActingPolicy(small_agent("vusfa", memory="lstm"))
+
+
+class TestDraws:
+    def test_are_categoricals(self) -> None:
+        logits = torch.randn(500, 4) * 3
+        torch.manual_seed(1)
+        wanted = Categorical(logits=logits).sample()
+        torch.manual_seed(1)
+        assert torch.equal(draw_actions(logits), wanted)
+
+    def test_by_hand(self) -> None:
+        logits = torch.tensor([0.0, 1.0, -torch.inf]).expand(20_000, 3)
+        share = draw_actions(logits).bincount(minlength=3) / 20_000
+        assert share[2].item() == 0
+        assert share[1].item() == pytest.approx(2.71828 / 3.71828, abs=0.02)
+
+    def test_a_mean_action_does_not_exist(self) -> None:
+        with pytest.raises(NotImplementedError, match="RANDOM or MODE"):
+            draw_actions(torch.zeros(2, 4), InteractionType.MEAN)

@@ -1,0 +1,130 @@
+"""The actor of one that only walks: the same actions as the actor's, for less.
+
+An actor made of tensordict modules writes down everything that a loss may want. Who collects or evaluates
+wants actions alone, at every step, of few rows; then moving tensors about costs as much as the products do.
+So here one module does it all: rows are brought into the order of scenes once, so that each scene reads one
+stretch of them, and nothing but the action is written.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from tensordict.nn.probabilistic import InteractionType, interaction_type
+from torch import Tensor
+
+from vusfa.modules.policy import SuccessorPolicyHead
+from vusfa.modules.trunk import SiameseTrunk
+
+if TYPE_CHECKING:
+    from vusfa.modules.agents import Agent
+
+__all__ = ["ActingPolicy", "action_logits", "draw_actions"]
+
+
+def action_logits(agent: Agent, state: Tensor, goal: Tensor, scene_id: Tensor) -> Tensor:
+    """An agent's logits, without anything else that its actor writes on the way.
+
+    Args:
+        agent: one without a memory.
+        state: (R, H) int64 ids, oldest first, or observations (R, H, ...), as the agent reads them.
+        goal: (R,) ids, or observations (R, ...).
+        scene_id: (R,) int64.
+
+    Returns:
+        (R, A) float32.
+
+    >>> from vusfa.modules import make_agent
+    >>> from vusfa.scenes import SceneSet
+    >>> agent = make_agent("vusfa", scenes=SceneSet.bundled(["bathroom"]))
+    >>> state, goal, scene_id = torch.zeros(3, 4).long(), torch.arange(3), torch.zeros(3).long()
+    >>> action_logits(agent, state, goal, scene_id).shape
+    torch.Size([3, 4])
+    """
+    fused = SiameseTrunk(agent.encoder, agent.fusion).fused(state, goal)
+    hidden = agent.scene_layer(fused, scene_id)
+    if isinstance(agent.policy, SuccessorPolicyHead):
+        assert agent.successor is not None
+        return agent.policy(hidden, agent.successor(hidden, scene_id), scene_id)
+    return agent.policy(hidden, scene_id)
+
+
+def draw_actions(logits: Tensor, interaction: InteractionType | None = None) -> Tensor:
+    """Actions (R,) int64 of logits (R, A): the likeliest, or a draw from their softmax.
+
+    Draws are those of ``torch.distributions.Categorical``, number for number, from torch's global generator.
+
+    Args:
+        logits: of the actions.
+        interaction: what is asked for; None is a draw. MODE and DETERMINISTIC are the likeliest.
+
+    Raises:
+        NotImplementedError: a mean or a median, which actions do not have.
+
+    >>> draw_actions(torch.tensor([[0.0, 9.0], [3.0, 1.0]]), InteractionType.DETERMINISTIC)
+    tensor([1, 0])
+    """
+    if interaction in (InteractionType.MODE, InteractionType.DETERMINISTIC):
+        return logits.argmax(-1)
+    if interaction in (None, InteractionType.RANDOM):
+        probability = (logits - logits.logsumexp(-1, keepdim=True)).softmax(-1)
+        return torch.multinomial(probability, 1, replacement=True).squeeze(-1)
+    raise NotImplementedError(f"interaction type {interaction}: actions have none; take RANDOM or MODE")
+
+
+class ActingPolicy(TensorDictModuleBase):
+    """Writes ``action``, and nothing else.
+
+    Draws by default; ``torchrl.envs.utils.set_exploration_type`` asks for the likeliest action. Weights are
+    the agent's own, so an update reaches it at once.
+
+    Args:
+        agent: any without a memory, which would have to be written down, too.
+
+    Raises:
+        ValueError: an agent with a memory; its actor is ``agent.get_policy_operator()``.
+
+    >>> from tensordict import TensorDict
+    >>> from vusfa.modules import make_agent
+    >>> from vusfa.scenes import SceneSet
+    >>> policy = ActingPolicy(make_agent("vusfa", scenes=SceneSet.bundled()))
+    >>> rows = TensorDict({"state_id": torch.zeros(3, 4).long(), "goal_id": torch.arange(3)}, [3])
+    >>> policy(rows.set("scene_id", torch.zeros(3).long()))["action"].shape
+    torch.Size([3])
+    """
+
+    def __init__(self, agent: Agent) -> None:
+        super().__init__()
+        if agent.memory is not None:
+            raise ValueError("the agent has a memory, which must be kept; take agent.get_policy_operator()")
+        self.agent = agent
+        by_id = agent.config["observation"] == "index"
+        self.in_keys = [
+            *(("state_id", "goal_id") if by_id else ("observation", "goal_observation")),
+            "scene_id",
+        ]
+        self.out_keys = ["action"]
+        self._num_scenes = len(agent.config["scenes"])
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Adds ``action``, (\\*B,) int64."""
+        state, goal, scene = (tensordict.get(key) for key in self.in_keys)
+        batch = scene.dim()
+        rows = (
+            state.reshape(-1, *state.shape[batch:]),
+            goal.reshape(-1, *goal.shape[batch:]),
+            scene.reshape(-1),
+        )
+        return tensordict.set(
+            "action", draw_actions(self._logits(*rows), interaction_type()).view(scene.shape)
+        )
+
+    def _logits(self, state: Tensor, goal: Tensor, scene: Tensor) -> Tensor:
+        if self._num_scenes == 1:
+            return action_logits(self.agent, state, goal, scene)
+        scene, order = scene.sort(stable=True)
+        logits = action_logits(self.agent, state[order], goal[order], scene)
+        return torch.empty_like(logits).index_copy_(0, order, logits)
