@@ -98,7 +98,12 @@ function number(name, value) {
   return isShare(name) ? (100 * value).toFixed(1) : value.toFixed(2);
 }
 
-const percent = (value) => (known(value) ? `${(100 * value).toFixed(value > 0.995 && value < 1 ? 1 : 0)} %` : "not known");
+// 99.95 % is not 100 %, nor is 0.3 % nothing
+function percent(value) {
+  if (!known(value)) return "not known";
+  const near = (value > 0.99 && value < 1) || (value > 0 && value < 0.01);
+  return `${near ? (Math.floor(1000 * value) / 10).toFixed(1) : (100 * value).toFixed(0)} %`;
+}
 const grouped = (value) => Math.round(value).toLocaleString("en-GB").replaceAll(",", " ");
 
 // ---- the tip

@@ -41,13 +41,14 @@ function drawing(scene) {
   return (plan.drawn = { x, y, paths, centres, width, height, next: unpack(plan.next) });
 }
 
-function floorMap(host, scene, label) {
+function floorMap(host, scene, label, small = false) {
   const { paths, width, height } = drawing(scene);
   const plan = DATA.scenes[scene];
+  const letter = small ? width * 0.055 : Math.max(0.35, width * 0.026); // a letter's height
   const ruler = plan.metric
-    ? `<path class="ruler" d="M0.1 ${height + 0.35}v0.25h${(1 / plan.cell).toFixed(3)}v-0.25"/><text class="ruler-text" x="${0.1 + 1 / plan.cell + 0.25}" y="${height + 0.66}">1 m</text>`
+    ? `<path class="ruler" stroke-width="${letter * 0.12}" d="M0.1 ${height + 0.35}v${letter * 0.5}h${(1 / plan.cell).toFixed(3)}v-${letter * 0.5}"/><text class="ruler-text" font-size="${letter}" x="${0.1 + 1 / plan.cell + letter * 0.5}" y="${height + 0.35 + letter * 0.7}">1 m</text>`
     : "";
-  host.innerHTML = `<svg viewBox="-0.1 -0.1 ${width + 0.2} ${height + 0.95}" role="img" aria-label="${label}">
+  host.innerHTML = `<svg viewBox="-0.1 -0.1 ${width + 0.2} ${height + 0.5 + letter}" role="img" aria-label="${label}">
     <g class="slices">${paths.map((d, i) => `<path class="s" data-i="${i}" d="${d}"/>`).join("")}</g>
     <g class="arrows"></g><g class="trail"></g><g class="marks"></g>${ruler}</svg>`;
   const slices = [...host.querySelectorAll("path.s")];
@@ -105,7 +106,7 @@ function startMaps() {
       const caption = make("figcaption");
       const floor = make("div", { class: "floor" });
       cells.append(make("figure", {}, caption, floor));
-      const map = floorMap(floor, row.scene, `${label}: success of every goal in ${words(row.scene)}`);
+      const map = floorMap(floor, row.scene, `${label}: success of every goal in ${words(row.scene)}`, true);
       const { centres, width } = drawing(row.scene);
       const size = Math.max(0.16, width * 0.011);
       map.layer("marks").innerHTML = row.trained.map((goal) => `<circle class="trained" cx="${centres[goal][0]}" cy="${centres[goal][1]}" r="${size}" stroke-width="${size * 0.45}"/>`).join("");
