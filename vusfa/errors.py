@@ -34,3 +34,7 @@ class CheckpointError(VusfaError):
 
 class ConfigError(VusfaError):
     """A configuration with a key or a value that nothing understands."""
+
+
+class ResultError(VusfaError):
+    """Results on disk that are damaged, or that cannot be written so."""

@@ -96,6 +96,7 @@ def evaluate(
     goals: Any = "all",
     *,
     trained: Tensor | None = None,
+    episodes: tuple[Tensor, Tensor] | None = None,
     episodes_per_goal: int = 10,
     max_steps: int = 500,
     history: int = 4,
@@ -117,6 +118,8 @@ def evaluate(
         scenes: the world; on the policy's device.
         goals: global state ids, or whatever :func:`vusfa.envs.goals.resolve_goals` takes.
         trained: global ids of the goals that the policy was trained on; they are marked in the table.
+        episodes: starts and goals (n,), global ids, of a manifest
+            (:mod:`vusfa.evaluation.manifest`); then ``goals`` and what follows of draws are not looked at.
         episodes_per_goal: episodes for each goal, from starts drawn uniformly.
         max_steps: actions allowed in an episode.
         history: frames H in ``state_id``.
@@ -130,11 +133,17 @@ def evaluate(
     Raises:
         GoalError: a goal that does not exist, or none that can be reached.
     """
-    goal_ids = resolve_goals(scenes, goals).cpu()
-    generator = torch.Generator().manual_seed(seed)
-    start, goal = episode_starts(
-        scenes, goal_ids, episodes_per_goal, unreachable=unreachable, generator=generator
-    )
+    if episodes is not None:
+        start, goal = (ids.cpu() for ids in episodes)
+    else:
+        generator = torch.Generator().manual_seed(seed)
+        start, goal = episode_starts(
+            scenes,
+            resolve_goals(scenes, goals).cpu(),
+            episodes_per_goal,
+            unreachable=unreachable,
+            generator=generator,
+        )
     devices = [scenes.successor.device] if scenes.successor.device.type == "cuda" else []
     exploration = ExplorationType.RANDOM if sample else ExplorationType.DETERMINISTIC
     with (

@@ -1,0 +1,85 @@
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import pytest
+import torch
+from torch import Tensor
+
+from vusfa.evaluation import evaluate
+from vusfa.evaluation.exact import agent_probabilities, exact_goals, reach_step
+from vusfa.evaluation.metrics import spl
+from vusfa.modules import ActingPolicy, Agent, make_agent
+from vusfa.scenes import Scene, SceneSet
+
+
+def uniform(state: Tensor, goal: Tensor, scene: Tensor) -> Tensor:
+    return torch.full((len(state), 4), 0.25)
+
+
+@pytest.fixture
+def rooms(make_scene: Callable[..., Scene]) -> SceneSet:
+    return SceneSet([make_scene("hall"), make_scene("attic", 3, 1)])
+
+
+@pytest.fixture
+def agent(rooms: SceneSet) -> Agent:
+    torch.manual_seed(0)
+    made = make_agent("vusfa", scenes=rooms, history=1, hidden_size=16, embedding_size=16)
+    with torch.no_grad():  # an untrained policy is nearly uniform: let it prefer something
+        for parameter in made.policy.parameters():
+            parameter.mul_(6.0)
+    return made.eval()
+
+
+def test_a_step_by_hand() -> None:
+    """Two states, one action that goes there with the chance p and one that stays."""
+    successor, goal = torch.tensor([[1, 0], [1, 1]]), torch.tensor([1])
+    chance = torch.tensor([[0.0, 1.0]])
+    for k in range(1, 5):
+        chance = reach_step(torch.tensor([[[0.3, 0.7], [0.5, 0.5]]]), successor, goal, chance)
+        assert chance[0, 0].item() == pytest.approx(1 - 0.7**k)
+
+
+def test_a_corridor_by_hand() -> None:
+    """Three states in a row, forward with the chance of one half, else blocked: SPL sums d / k P(arrive at
+    k)."""
+    corridor = torch.tensor([[1, -1], [2, -1], [-1, -1]])
+    scenes = SceneSet([Scene("corridor", corridor, torch.rand(3, 1, 4))])
+    table = exact_goals(lambda state, goal, scene: torch.full((len(state), 2), 0.5), scenes)
+    assert table.goal.tolist() == [1, 2]  # nothing leads to the first
+    one = sum(0.5**k / k for k in range(1, 501))
+    two = sum((k - 1) * 0.5**k * 2 / k for k in range(2, 501))
+    torch.testing.assert_close(table.spl, torch.tensor([one, (one + two) / 2], dtype=torch.float64))
+    torch.testing.assert_close(table.success_500, torch.ones(2, dtype=torch.float64))
+    missed = 0.5**100, (0.5**100 + 101 * 0.5**100) / 2
+    torch.testing.assert_close(
+        1 - table.success_100, torch.tensor(missed, dtype=torch.float64), atol=1e-12, rtol=0
+    )
+
+
+@pytest.mark.parametrize("greedy", [False, True])
+def test_beside_sampled_episodes(rooms: SceneSet, agent: Agent, greedy: bool) -> None:
+    """Each mean of 400 episodes a goal lies within five of its standard errors of what is computed."""
+    exact = exact_goals(agent_probabilities(agent, greedy), rooms, agent)
+    sampled = evaluate(
+        ActingPolicy(agent), rooms, episodes_per_goal=400, max_steps=500, history=1, sample=not greedy
+    )
+    assert exact.success_100.min() < 1
+    for row in range(len(exact.goal)):
+        here = sampled.select((sampled.goal == exact.goal[row]) & (sampled.scene == exact.scene[row]))
+        within = (here.success & (here.length <= 100)).double().mean()
+        error = max(0.004, 0.025 * 4 * float(within * (1 - within)) ** 0.5)
+        assert abs(within - exact.success_100[row]) < 2.5 * error
+        assert abs(spl(here.success, here.length, here.shortest) - exact.spl[row]) < 0.125
+
+
+def test_goals_are_computed_together_or_apart(rooms: SceneSet, agent: Agent) -> None:
+    tables = [exact_goals(agent_probabilities(agent), rooms, at_once=size) for size in (5, 64)]
+    torch.testing.assert_close(tables[0].spl, tables[1].spl, atol=1e-5, rtol=1e-5)
+    assert torch.equal(tables[0].goal, tables[1].goal)
+
+
+def test_an_agent_of_more_frames_is_refused(rooms: SceneSet) -> None:
+    with pytest.raises(ValueError, match="history=4"):
+        agent_probabilities(make_agent("gvf", scenes=rooms))

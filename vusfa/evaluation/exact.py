@@ -1,0 +1,146 @@
+"""What a policy of one frame is worth, without drawing an episode.
+
+Where an agent sees one frame and no more, its actions depend on the state and the goal alone: to each goal
+its walk is a Markov chain on the scene's graph. With p(a | s, g) its probabilities and s.a where a leads,
+
+    h_0(s) = 1 if s = g else 0,    h_k(s) = sum_a p(a | s, g) h_{k-1}(s.a),    h_k(g) = 1
+
+is the chance of having met g within k actions from s. SPL is the sum over k of (h_k - h_{k-1}) d / max(d, k)
+with d the shortest path (Anderson et al. 2018, eq. 1, in expectation).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, fields
+
+import torch
+from torch import Tensor
+
+from vusfa.modules import Agent, action_logits, frozen
+from vusfa.scenes import SceneSet
+
+__all__ = ["ExactGoals", "agent_probabilities", "exact_goals", "reach_step"]
+
+Probabilities = Callable[[Tensor, Tensor, Tensor], Tensor]
+
+
+@dataclass(frozen=True, eq=False)
+class ExactGoals:
+    """One row a goal, means over all starts that it can be reached from; every column a tensor (G,).
+
+    Args:
+        scene: int64, index of the scene.
+        goal: int64, state id within its scene.
+        success_100, success_500: float64, chance of meeting it within so many actions.
+        spl: float64, of walks of at most 500 actions.
+    """
+
+    scene: Tensor
+    goal: Tensor
+    success_100: Tensor
+    success_500: Tensor
+    spl: Tensor
+
+    def __post_init__(self) -> None:
+        shapes = {field.name: tuple(getattr(self, field.name).shape) for field in fields(self)}
+        if len(set(shapes.values())) != 1 or self.scene.ndim != 1:
+            raise ValueError(f"the columns of a table of goals must all be (G,); they are {shapes}")
+
+
+def reach_step(probability: Tensor, successor: Tensor, goal: Tensor, chance: Tensor) -> Tensor:
+    """h_k of h_{k-1}: chances (G, N) of having met each goal within one action more.
+
+    Args:
+        probability: (G, N, A), of actions on the way to each goal.
+        successor: (N, A) int64, where actions lead; a blocked one, to the state itself.
+        goal: (G,) int64.
+        chance: (G, N), before.
+
+    >>> corridor, fair = torch.tensor([[0, 1], [0, 2], [1, 2]]), torch.full((1, 3, 2), 0.5)
+    >>> goal, chance = torch.tensor([2]), torch.tensor([[0.0, 0.0, 1.0]])
+    >>> for _ in range(3):
+    ...     chance = reach_step(fair, corridor, goal, chance)
+    >>> chance
+    tensor([[0.3750, 0.6250, 1.0000]])
+    """
+    chance = (probability * chance[:, successor]).sum(-1)
+    chance[torch.arange(len(goal), device=goal.device), goal] = 1
+    return chance
+
+
+def agent_probabilities(agent: Agent, greedy: bool = False) -> Probabilities:
+    """The probabilities (R, A) of an agent's actions for ids of states, goals and scenes, (R,) each.
+
+    Args:
+        agent: one that sees one frame, by its id, and has no memory.
+        greedy: all on the likeliest action.
+
+    Raises:
+        ValueError: another agent, whose walk is no Markov chain on the graph.
+    """
+    config = agent.config
+    if config["history"] != 1 or config["observation"] != "index" or config["memory"] is not None:
+        raise ValueError(
+            "an exact evaluation needs an agent of one frame, without a memory, that reads ids; this one has"
+            f" history={config['history']}, observation={config['observation']}, memory={config['memory']}"
+        )
+
+    def probabilities(state: Tensor, goal: Tensor, scene: Tensor) -> Tensor:
+        logits = action_logits(agent, state.unsqueeze(-1), goal, scene)
+        if greedy:
+            return torch.nn.functional.one_hot(logits.argmax(-1), logits.shape[-1]).to(logits.dtype)
+        return logits.softmax(-1)
+
+    return probabilities
+
+
+@torch.no_grad()
+def exact_goals(
+    probabilities: Probabilities, scenes: SceneSet, agent: Agent | None = None, *, at_once: int = 64
+) -> ExactGoals:
+    """Every state of every scene as a goal, from every start that it can be reached from.
+
+    Args:
+        probabilities: of actions, see :func:`agent_probabilities`.
+        scenes: the world.
+        agent: what ``probabilities`` come from: then it encodes the world once.
+        at_once: goals that are computed together.
+
+    >>> rooms = SceneSet.bundled(["bathroom"])
+    >>> exact_goals(lambda state, goal, scene: torch.full((len(state), 4), 0.25), rooms).success_500.shape
+    torch.Size([176])
+    """
+    rows = []
+    with frozen(agent if agent is not None else torch.nn.Module()):
+        for index, scene in enumerate(scenes.scenes):
+            first = int(scenes.offsets[index])
+            for goals in torch.arange(scene.num_states).split(at_once):
+                rows.append(_some_goals(probabilities, scenes, index, first, goals))
+    return ExactGoals(*(torch.cat(column) for column in zip(*rows, strict=True)))
+
+
+def _some_goals(
+    probabilities: Probabilities, scenes: SceneSet, index: int, first: int, goals: Tensor
+) -> tuple[Tensor, ...]:
+    scene = scenes.scenes[index]
+    size = scene.num_states
+    state = torch.arange(size).repeat(len(goals)) + first
+    goal = goals.repeat_interleave(size) + first
+    chance = probabilities(state, goal, torch.full_like(state, index)).view(len(goals), size, -1).double()
+    successor = scenes.successor[first : first + size] - first
+    shortest = scene.distance[:, goals].T
+    counted = shortest > 0
+    before = chance.new_zeros(len(goals), size)
+    before[torch.arange(len(goals)), goals] = 1
+    reached, spl = {}, chance.new_zeros(len(goals), size)
+    for k in range(1, 501):
+        now = reach_step(chance, successor, goals, before)
+        spl += (now - before) * shortest / shortest.clamp(min=k)
+        before = now
+        if k in (100, 500):
+            reached[k] = now
+    kept = counted.any(1)
+    means = [(values * counted).sum(1) / counted.sum(1) for values in (reached[100], reached[500], spl)]
+    columns = torch.full_like(goals, index), goals, *means
+    return tuple(column[kept] for column in columns)
