@@ -1,0 +1,116 @@
+"""Three tiny trained runs, the page made of them, and a browser to open it in."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import sys
+from collections.abc import Callable, Iterator
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from omegaconf import OmegaConf
+
+from vusfa.evaluation import Episodes
+from vusfa.report import Options, read_run, write_report
+from vusfa.report.runs import Run
+from vusfa.training.launch import compose
+
+RECIPES = Path(__file__).parents[2] / "recipes"
+
+
+@pytest.fixture(scope="session")
+def run_folders(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    """Two seeds of vusfa, one of gvf, in two bundled rooms; every state was a goal once."""
+    sys.path.insert(0, str(RECIPES))
+    train = import_module("train").train
+    sys.path.remove(str(RECIPES))
+    sys.modules.pop("train")
+    folders = []
+    for model, seed in (("vusfa", 0), ("vusfa", 1), ("gvf", 0)):
+        folder = tmp_path_factory.mktemp("runs") / f"{model}-{seed}"
+        overrides = [
+            f"agent.model={model}",
+            f"seed={seed}",
+            f"folder={folder}",
+            "scenes=[bathroom,bedroom]",
+            "env.max_steps=20",
+            "agent.history=1",
+            "agent.hidden_size=8",
+            "agent.embedding_size=8",
+            "collector.num_envs=10",
+            "collector.rollout=10",
+            "total_frames=2000",
+            "log_every=200",
+            "evaluation=all",
+            "evaluation.episodes_per_goal=1",
+            "evaluation.max_steps=20",
+        ]
+        cfg = compose(RECIPES / "conf", "train", overrides)
+        OmegaConf.resolve(cfg)
+        train(cfg, overrides)
+        folders.append(folder)
+    return folders
+
+
+@pytest.fixture(scope="session")
+def runs(run_folders: list[Path]) -> list[Run]:
+    """Those runs, read."""
+    return [read_run(folder) for folder in run_folders]
+
+
+@pytest.fixture(scope="session")
+def page(runs: list[Run], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Their page, with a title that is no HTML."""
+    out = tmp_path_factory.mktemp("report") / "page.html"
+    options = Options(title="A <b>title</b> & </script>", goals_per_scene=8, walks=2, max_steps=30)
+    write_report(runs, out, options)
+    return out
+
+
+@pytest.fixture
+def corridor_run() -> Callable[..., Run]:
+    """A run with episodes: rows of goal, start, success, length, shortest, collisions, trained."""
+
+    def made(
+        label: str, seed: int, rows: list[tuple[int, ...]], scene: str = "hall", limit: int = 100
+    ) -> Run:
+        goal, start, success, length, shortest, collisions, trained = torch.tensor(rows).T
+        table = Episodes(
+            torch.zeros_like(goal),
+            goal,
+            start,
+            success > 0,
+            length,
+            shortest,
+            collisions,
+            trained > 0,
+            (scene,),
+            limit,
+        )
+        return Run(label, seed, Path(f"{label}-{seed}"), {"agent": {"model": label}, "scenes": []}, {}, table)
+
+    return made
+
+
+@pytest.fixture(scope="session")
+def chromium() -> Iterator[Any]:
+    """A headless Chromium."""
+    reason, program = "", shutil.which("chromium") or shutil.which("chromium-browser")
+    try:
+        from playwright.sync_api import sync_playwright
+    except ImportError:
+        reason = "not installed: playwright (of the extra dev)"
+    if not reason and program is None:
+        reason = "not installed: Chromium (Debian's chromium)"
+    if reason:
+        (pytest.fail if os.environ.get("CI") else pytest.skip)(reason)
+    switches = ["--no-sandbox", "--disable-gpu", "--no-first-run", "--disable-background-networking"]
+    switches += ["--disable-component-update", "--disable-sync", "--disable-quic"]
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=program, args=switches)
+        yield browser
+        browser.close()

@@ -1,0 +1,233 @@
+"""The page in a real browser: it draws itself, its controls change what is shown, it asks for nothing."""
+
+from __future__ import annotations
+
+import csv
+import itertools
+import json
+import re
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from vusfa.report.runs import Run
+from vusfa.scenes import Scene
+
+pytestmark = pytest.mark.browser
+
+
+@pytest.fixture(scope="module")
+def opened(chromium: Any, page: Path) -> Iterator[tuple[Any, list[str], list[str]]]:
+    """The page, what it complained of, and what it asked for."""
+    complaints: list[str] = []
+    asked: list[str] = []
+    context = chromium.new_context(viewport={"width": 1280, "height": 900}, color_scheme="light")
+    tab = context.new_page()
+    tab.on("console", lambda message: complaints.append(f"{message.type}: {message.text}"))
+    tab.on("pageerror", lambda error: complaints.append(str(error)))
+    tab.on("request", lambda request: asked.append(request.url))
+    tab.goto(page.as_uri())
+    tab.wait_for_selector("html[data-ready=yes]")
+    yield tab, complaints, asked
+    context.close()
+
+
+@pytest.fixture
+def tab(opened: tuple[Any, list[str], list[str]]) -> Iterator[Any]:
+    """The page; a test fails when it complains."""
+    tab, complaints, _ = opened
+    yield tab
+    assert complaints == []
+
+
+def points(tab: Any, chart: str) -> Any:
+    """What a chart of Plotly shows."""
+    return tab.evaluate(
+        f"document.getElementById('{chart}').data.map((trace) => [trace.name, trace.x, trace.y])"
+    )
+
+
+def until(tab: Any, condition: str) -> None:
+    """Wait until the page says so; its own rule keeps Playwright from waiting inside it."""
+    give_up = time.monotonic() + 20
+    while not tab.evaluate(condition):
+        assert time.monotonic() < give_up, condition
+        time.sleep(0.02)
+
+
+def colours(tab: Any, selector: str) -> list[str]:
+    return tab.evaluate(f"[...document.querySelectorAll('{selector} path.s')].map((path) => path.style.fill)")
+
+
+def test_it_draws_all_its_parts(tab: Any, runs: list[Run]):
+    assert tab.title() == "A <b>title</b> & </script>"
+    assert tab.inner_text("h1") == "A <b>title</b> & </script>"
+    for chart in ("overview", "distance-plot", "curves"):
+        assert tab.locator(f"#{chart} .main-svg").count() >= 1, chart
+        assert tab.locator(f"#{chart} path.point, #{chart} path.js-line").count() >= 2, chart
+    assert tab.locator("#run-table tbody tr").count() == len(runs)
+    names = tab.locator("#summary tbody tr td:first-child").all_inner_texts()
+    assert names == ["vusfa", "gvf", "random walk", "shortest path"]
+    assert tab.locator("#map-grid .map-row").count() == 3  # two models and the random walk
+    assert len(colours(tab, "#map-grid .map-row:first-child")) == 176 + 404
+    assert len(set(colours(tab, "#x-map"))) > 20
+
+
+def test_the_table_shows_what_the_csv_holds(tab: Any, page: Path):
+    with open(page.parent / "page_tables" / "summary.csv", newline="", encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    for goals, scene in (("unseen", "mean of scenes"), ("trained", "bedroom"), ("all", "mean of states")):
+        tab.select_option("#subset", goals)
+        tab.select_option("#scene", scene)
+        (row,) = (r for r in rows if (r["model"], r["goals"], r["scene"]) == ("vusfa", goals, scene))
+        cells = tab.locator("#summary tbody tr:first-child td").all_inner_texts()
+        mean, low, high = (f"{100 * float(row[f'success_20{end}']):.1f}" for end in ("", "_low", "_high"))
+        assert cells[1] == row["seeds"] == "2"
+        assert cells[2].split() == [mean, low, "–", high]
+
+
+@pytest.mark.parametrize(
+    ("control", "chart"),
+    [
+        ("measure", "overview"),
+        ("subset", "overview"),
+        ("scene", "overview"),
+        ("distance-measure", "distance-plot"),
+        ("curve", "curves"),
+        ("curve-scene", "curves"),
+        ("curve-axis", "curves"),
+        ("smooth", "curves"),
+    ],
+)
+def test_controls_change_the_charts(tab: Any, control: str, chart: str):
+    tab.select_option("#curve", "length")
+    tab.select_option(f"#{control}", index=0)
+    before = points(tab, chart)
+    tab.select_option(f"#{control}", index=tab.locator(f"#{control} option").count() - 1)
+    assert points(tab, chart) != before
+
+
+def test_the_map_shows_success_by_goal(tab: Any, runs: list[Run]):
+    tab.select_option("#map-measure", "success_20")
+    shown = colours(tab, "#map-grid .map-row:nth-child(2)")[:176]  # gvf in the bathroom
+    episodes = runs[2].episodes
+    assert episodes is not None
+    reached = {
+        int(goal): bool(ok)
+        for goal, ok, scene in zip(episodes.goal, episodes.success, episodes.scene, strict=True)
+        if scene == 0
+    }
+    best, worst = "rgb(253, 231, 37)", "rgb(68, 1, 84)"
+    assert [colour == best for colour in shown] == [reached[goal] for goal in range(176)]
+    assert set(shown) <= {best, worst}
+    tab.select_option("#map-measure", "spl")
+    assert len(set(colours(tab, "#map-grid .map-row:nth-child(2)")[:176])) > 2
+
+
+def test_the_explorer_follows_its_controls(tab: Any):
+    tab.select_option("#x-agent", label="vusfa, seed 0")
+    tab.select_option("#x-scene", "bathroom")
+    tab.select_option("#x-goal", index=0)
+    layers: dict[str, list[str]] = {}
+    for layer in ("value", "psi0", "psi1", "psi2", "sure", "togo"):
+        tab.select_option("#x-layer", layer)
+        layers[layer] = colours(tab, "#x-map")
+    assert len({tuple(found) for found in layers.values()}) == len(layers)
+    assert tab.locator("#x-map .arrow").count() > 0
+    tab.uncheck("#x-arrows")
+    assert tab.locator("#x-map .arrow").count() == 0
+    tab.check("#x-arrows")
+    tab.select_option("#x-layer", "value")
+    target = tab.get_attribute("#x-target", "src")
+    tab.select_option("#x-goal", index=1)
+    assert colours(tab, "#x-map") != layers["value"]
+    assert tab.get_attribute("#x-target", "src") != target
+    tab.select_option("#x-scene", "bedroom")
+    assert len(colours(tab, "#x-map")) == 404
+    before = colours(tab, "#x-map")
+    tab.select_option("#x-agent", label="gvf, seed 0")
+    assert colours(tab, "#x-map") != before
+    assert "has no ψ" in tab.inner_text("#x-note")
+    assert not any("ψ" in text for text in tab.locator("#x-layer option").all_inner_texts())
+
+
+def test_walks_go_along_the_graph_with_their_pictures(tab: Any):
+    tab.select_option("#x-agent", label="vusfa, seed 0")
+    tab.select_option("#x-scene", "bathroom")
+    graph = Scene.bundled("bathroom").graph
+    for goal in range(3):
+        tab.select_option("#x-goal", index=goal)
+        for walk in range(2):
+            tab.select_option("#x-walk", str(walk))
+            way = tab.evaluate("at.way")
+            assert 1 <= len(way) - 1 <= 30
+            for here, there in itertools.pairwise(way):
+                assert there in [*graph[here].tolist(), here]
+            arrives = tab.inner_text("#x-status").startswith(f"Arrives after {len(way) - 1} action")
+            assert arrives == (way[-1] == int(tab.input_value("#x-goal")))
+    tab.locator("#x-step").fill("1")
+    assert tab.inner_text("#x-count").startswith("1 of ")
+    for image in ("x-view", "x-target"):
+        until(tab, f"document.getElementById('{image}').naturalWidth === 200")
+    tab.click("#x-play")
+    until(tab, "Number(document.getElementById('x-step').value) >= 3")
+    tab.click("#x-play")
+
+
+def test_a_pose_that_is_pressed_begins_a_walk(tab: Any):
+    tab.select_option("#x-agent", label="vusfa, seed 0")
+    tab.select_option("#x-scene", "bathroom")
+    tab.select_option("#x-goal", index=0)
+    start = 40 if tab.input_value("#x-goal") != "40" else 41
+    tab.locator(f'#x-map path.s[data-i="{start}"]').click(force=True)
+    assert tab.evaluate("at.way[0]") == start
+    assert tab.input_value("#x-walk") == "own"
+    assert tab.locator("#tip").is_visible()
+
+
+def test_a_goal_pressed_on_a_map_opens_in_the_explorer(tab: Any):
+    goals = json.loads(
+        tab.inner_text("#data") or tab.evaluate("document.getElementById('data').textContent")
+    )["goals"]
+    goal = goals["bedroom"][3]
+    row = tab.locator("#map-grid .map-row").nth(1)
+    row.locator(".floor").nth(1).locator(f'path.s[data-i="{goal}"]').dispatch_event("click")
+    assert tab.input_value("#x-scene") == "bedroom"
+    assert tab.input_value("#x-goal") == str(goal)
+    assert tab.evaluate("agentNow().model") == "gvf"
+
+
+def test_light_and_dark(tab: Any):
+    def looks() -> Any:
+        return tab.evaluate(
+            "[getComputedStyle(document.body).backgroundColor, $('curves').layout.font.color]"
+        )
+
+    light = looks()
+    tab.click("#theme")
+    dark = looks()
+    tab.click("#theme")
+    assert dark[0] != light[0]
+    assert dark[1] != light[1]
+    assert looks() == light
+
+
+@pytest.mark.parametrize("width", [1280, 390])
+def test_nothing_is_wider_than_the_screen(tab: Any, width: int):
+    tab.set_viewport_size({"width": width, "height": 800})
+    until(tab, f"document.querySelector('#overview .main-svg').clientWidth < {width}")
+    assert tab.evaluate("document.documentElement.scrollWidth") <= width
+
+
+def test_nothing_is_fetched_from_outside(opened: tuple[Any, list[str], list[str]], page: Path):
+    tab, complaints, asked = opened
+    outside = [url for url in asked if url != page.as_uri() and not re.match(r"(data|blob):", url)]
+    assert outside == []
+    # and the page's own rule would forbid it
+    refused = tab.evaluate("fetch('http://127.0.0.1:9/x').then(() => 'fetched', () => 'refused')")
+    assert refused == "refused"
+    assert any("Content Security Policy" in complaint for complaint in complaints)
+    complaints.clear()

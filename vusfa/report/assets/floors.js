@@ -1,0 +1,127 @@
+// Floor maps: every place a square, every heading a slice of it; and the maps of success.
+
+const HALF = 0.47; // of a square's side; the unit is the distance between neighbouring places
+
+function towards(degrees, reach = 1) {
+  const angle = (degrees * Math.PI) / 180;
+  return [Math.sin(angle) * reach, -Math.cos(angle) * reach];
+}
+
+function outline(x, y, first, last) {
+  const rim = (degrees) => {
+    const [dx, dy] = towards(degrees);
+    const reach = HALF / Math.max(Math.abs(dx), Math.abs(dy));
+    return [x + dx * reach, y + dy * reach];
+  };
+  const whole = last - first > 359.9;
+  const angles = whole ? [45, 135, 225, 315] : [first];
+  if (!whole) {
+    for (let corner = 45 + 90 * Math.ceil((first - 45) / 90); corner < last; corner += 90) if (corner > first) angles.push(corner);
+    angles.push(last);
+  }
+  const points = angles.map(rim);
+  if (!whole) points.push([x, y]);
+  return `M${points.map(([a, b]) => `${a.toFixed(3)} ${b.toFixed(3)}`).join("L")}Z`;
+}
+
+// Where things are drawn, computed once for each scene.
+function drawing(scene) {
+  const plan = DATA.scenes[scene];
+  if (plan.drawn) return plan.drawn;
+  const lowX = Math.min(...plan.x), highX = Math.max(...plan.x), lowZ = Math.min(...plan.z), highZ = Math.max(...plan.z);
+  const x = plan.x.map((value) => (value - lowX) / plan.cell + 0.5);
+  const y = plan.z.map((value) => (highZ - value) / plan.cell + 0.5);
+  const paths = x.map((_, i) => outline(x[i], y[i], plan.first[i], plan.last[i]));
+  const centres = x.map((_, i) => {
+    if (plan.last[i] - plan.first[i] > 359.9) return [x[i], y[i]];
+    const [dx, dy] = towards((plan.first[i] + plan.last[i]) / 2, 0.3);
+    return [x[i] + dx, y[i] + dy];
+  });
+  const width = (highX - lowX) / plan.cell + 1, height = (highZ - lowZ) / plan.cell + 1;
+  return (plan.drawn = { x, y, paths, centres, width, height, next: unpack(plan.next) });
+}
+
+function floorMap(host, scene, label, small = false) {
+  const { paths, width, height } = drawing(scene);
+  const plan = DATA.scenes[scene];
+  const letter = small ? width * 0.055 : Math.max(0.35, width * 0.026); // a letter's height
+  const ruler = plan.metric
+    ? `<path class="ruler" stroke-width="${letter * 0.12}" d="M0.1 ${height + 0.35}v${letter * 0.5}h${(1 / plan.cell).toFixed(3)}v-${letter * 0.5}"/><text class="ruler-text" font-size="${letter}" x="${0.1 + 1 / plan.cell + letter * 0.5}" y="${height + 0.35 + letter * 0.7}">1 m</text>`
+    : "";
+  host.innerHTML = `<svg viewBox="-0.1 -0.1 ${width + 0.2} ${height + 0.5 + letter}" role="img" aria-label="${label}">
+    <g class="slices">${paths.map((d, i) => `<path class="s" data-i="${i}" d="${d}"/>`).join("")}</g>
+    <g class="arrows"></g><g class="trail"></g><g class="marks"></g>${ruler}</svg>`;
+  const slices = [...host.querySelectorAll("path.s")];
+  const layer = (name) => host.querySelector(`.${name}`);
+  return {
+    paint: (colour) => slices.forEach((path, i) => { const found = colour(i); path.style.fill = found === "none" ? "var(--wall)" : found; }),
+    layer,
+    // what(state, event) when the pointer is over a state, chosen(state) when it is pressed
+    listen: (what, chosen) => {
+      host.addEventListener("pointermove", (event) => (event.target.dataset.i === undefined ? hush() : what(Number(event.target.dataset.i), event)));
+      host.addEventListener("pointerleave", hush);
+      host.addEventListener("click", (event) => { if (event.target.dataset.i !== undefined) chosen(Number(event.target.dataset.i), event); });
+    },
+  };
+}
+
+function tipOf(scene, state, ...lines) {
+  const content = [];
+  const url = picture(scene, state);
+  if (url) content.push(make("img", { src: url, alt: "" }));
+  for (const line of lines) content.push(make("div", {}, line));
+  return content;
+}
+
+// ---- the maps of success
+
+const successMaps = [];
+
+function paintSuccess() {
+  const name = $("map-measure").value;
+  drawScale($("map-scale"), VIRIDIS, "0", "100", "%");
+  for (const { map, row, caption } of successMaps) {
+    const values = row[name] ? unpack(row[name]) : [];
+    map.paint((state) => ramp(VIRIDIS, values[state]));
+    const seen = Array.from(values).filter(Number.isFinite);
+    const mean = seen.length ? seen.reduce((sum, value) => sum + value, 0) / seen.length : NaN;
+    caption.replaceChildren(make("b", {}, words(row.scene)), ` · ${seen.length ? `mean ${percent(mean)}` : "not measured"}`);
+  }
+}
+
+function startMaps() {
+  const grid = $("map-grid");
+  const labels = [...new Set(DATA.maps.map((row) => row.model))];
+  const names = [...new Set(DATA.maps.flatMap((row) => Object.keys(row).filter(isShare)))];
+  const order = DATA.measures.filter((name) => names.includes(name));
+  const hardest = order.filter((name) => name.startsWith("success_")).at(-1);
+  fill($("map-measure"), order.map((name) => [name, titleOf(name).replace(/^Goals reached/, "Reached")]), hardest);
+  $("maps").hidden = !DATA.maps.length;
+  for (const label of labels) {
+    const rows = DATA.maps.filter((row) => row.model === label);
+    const cells = make("div", { class: "map-cells" });
+    const of = rows[0].seeds ? `${rows[0].episodes} episodes a goal, of ${rows[0].seeds} seed${rows[0].seeds > 1 ? "s" : ""} together` : "computed exactly, from every start";
+    grid.append(make("div", { class: "map-row" }, make("h3", {}, label, make("span", {}, of)), cells));
+    for (const row of rows) {
+      const caption = make("figcaption");
+      const floor = make("div", { class: "floor" });
+      cells.append(make("figure", {}, caption, floor));
+      const map = floorMap(floor, row.scene, `${label}: success of every goal in ${words(row.scene)}`, true);
+      const { centres, width } = drawing(row.scene);
+      const size = Math.max(0.16, width * 0.011);
+      map.layer("marks").innerHTML = row.trained.map((goal) => `<circle class="trained" cx="${centres[goal][0]}" cy="${centres[goal][1]}" r="${size}" stroke-width="${size * 0.45}"/>`).join("");
+      map.listen(
+        (state, event) => {
+          const name = $("map-measure").value;
+          const value = row[name] ? unpack(row[name])[state] : NaN;
+          const kind = row.trained.includes(state) ? ", trained" : "";
+          tell(event, ...tipOf(row.scene, state, `goal ${state}${kind}: ${percent(value)}`));
+        },
+        (state, event) => openGoal(label, row.scene, state, event),
+      );
+      successMaps.push({ map, row, caption });
+    }
+  }
+  $("map-measure").addEventListener("change", paintSuccess);
+  redraws.push(paintSuccess);
+}

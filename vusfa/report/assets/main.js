@@ -1,0 +1,44 @@
+// Puts the page together.
+
+function setTheme(name) {
+  document.documentElement.dataset.theme = name;
+  $("theme").textContent = name === "dark" ? "Light" : "Dark";
+  for (const draw of redraws) draw();
+}
+
+function introduce() {
+  const strong = (text) => make("strong", {}, text);
+  const plural = (count, word) => `${count} ${word}${count === 1 ? "" : "s"}`;
+  const scenes = Object.values(DATA.scenes), states = scenes.reduce((sum, scene) => sum + scene.states, 0);
+  const runs = DATA.tables.runs.length;
+  $("lede").replaceChildren(
+    strong(plural(DATA.models.length, "model")), " in ", strong(plural(runs, "run")), ", walking through ", strong(plural(scenes.length, "scene")), " of ",
+    strong(`${grouped(states)} poses`), ": each agent is shown a picture of the place where it should be, and walks there by what it sees.",
+  );
+  const { vusfa, torch, python } = DATA.versions;
+  const said = [`Made by vusfa ${vusfa} with PyTorch ${torch} and Python ${python}`, DATA.command ? `, by: ${DATA.command}` : "", "."];
+  const shown = Math.max(0, ...Object.values(DATA.goals).map((goals) => goals.length));
+  said.push(` To keep the page small, values and components of ψ are rounded to 255 levels between the ends of their scales, pictures are shrunk, and the explorer has at most ${shown} goals a scene`);
+  said.push(DATA.goals_asked > shown && DATA.goals_limit < DATA.goals_asked ? ` (${DATA.goals_asked} were asked for).` : ".");
+  said.push(" The tables lie beside this page as CSV, unrounded.");
+  $("about").textContent = said.join("");
+}
+
+function watchSections() {
+  const links = [...document.querySelectorAll(".bar a")];
+  for (const link of links) link.hidden = document.querySelector(link.hash).hidden;
+  const watcher = new IntersectionObserver((entries) => {
+    for (const entry of entries) if (entry.isIntersecting) links.forEach((link) => link.classList.toggle("here", link.hash === `#${entry.target.id}`));
+  }, { rootMargin: "-20% 0px -70% 0px" });
+  document.querySelectorAll("main section").forEach((section) => watcher.observe(section));
+}
+
+introduce();
+document.documentElement.dataset.theme = matchMedia("(prefers-color-scheme: dark)").matches ? "dark" : "light";
+startCharts();
+startMaps();
+startExplorer();
+watchSections();
+$("theme").addEventListener("click", () => setTheme(theme() === "dark" ? "light" : "dark"));
+setTheme(theme());
+document.documentElement.dataset.ready = "yes";

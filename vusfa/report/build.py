@@ -1,0 +1,46 @@
+"""Runs in, a page and its tables out."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from vusfa.errors import ConfigError
+from vusfa.report.content import Options, Row, add_pictures, gather, open_scenes
+from vusfa.report.page import page_weight, write_page, write_tables
+from vusfa.report.runs import Run
+
+__all__ = ["write_report"]
+
+
+def write_report(
+    runs: Sequence[Run], out: str | Path, options: Options | None = None
+) -> tuple[list[Path], dict[str, list[Row]]]:
+    """Writes the page, and its tables as CSV into a folder beside it, ``PAGE_tables``.
+
+    Args:
+        runs: what to report.
+        out: the page; its folder is made when it is missing.
+        options: see :class:`~vusfa.report.content.Options`.
+
+    Returns:
+        the paths, the page first, and the tables.
+
+    Raises:
+        ConfigError: no runs, runs that do not fit one another, or more than the page may weigh.
+        VusfaError: a scene or a checkpoint that cannot be read.
+    """
+    options, out = options or Options(), Path(out)
+    content, tables = gather(runs, options)
+    weight, most = page_weight(content), options.megabytes * 1e6
+    if weight > most:
+        raise ConfigError(
+            f"the page weighs {weight / 1e6:.1f} MB before a single picture, more than megabytes="
+            f"{options.megabytes:g}; give fewer goals_per_scene, seeds or walks, or more megabytes"
+        )
+    options.tell("pictures")
+    # every state's id and where its picture ends take up to 16 bytes
+    states = sum(scene["states"] for scene in content["scenes"].values())
+    add_pictures(content, open_scenes(runs), max(0, int(most - weight) - 16 * states - 1000))
+    page = write_page(out, content)
+    return [page, *write_tables(out.with_name(f"{out.stem}_tables"), tables)], tables

@@ -1,0 +1,262 @@
+"""From runs to everything that a report's page shows, as plain data."""
+
+from __future__ import annotations
+
+import platform
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import torch
+
+import vusfa
+from vusfa.errors import ConfigError
+from vusfa.evaluation import random_walk
+from vusfa.report.curves import learning_curves
+from vusfa.report.explorer import choose_goals, choose_starts, sampled_walks, state_maps
+from vusfa.report.geometry import floor_plan
+from vusfa.report.packing import pack
+from vusfa.report.pictures import thumbnails
+from vusfa.report.runs import Run
+from vusfa.report.tables import distance_rows, goal_rows, measures, run_rows, seed_rows, summary_rows
+from vusfa.scenes import Scene, SceneSet
+from vusfa.training import load_agent
+
+__all__ = ["Options", "add_pictures", "gather", "goal_limit", "open_scenes", "tables"]
+
+Row = dict[str, Any]
+
+_BYTES_A_STATE = 16  # of one goal's maps, in base 64: value, three components, four probabilities
+_SHARE_OF_MAPS = 0.4
+
+
+@dataclass(frozen=True)
+class Options:
+    """What goes into a page.
+
+    Args:
+        title: of the page.
+        within: numbers of actions to give the success for.
+        goals_per_scene: goals of each scene in the explorer, at most.
+        seeds: runs of each model in the explorer, the first ones.
+        walks: sampled walks to each of these goals.
+        max_steps: actions allowed in these walks.
+        megabytes: what the page may weigh.
+        command: that made it, for whoever makes it again.
+        tell: called with a line on what is being done.
+    """
+
+    title: str = "What the runs learned"
+    within: Sequence[int] = (500, 100)
+    goals_per_scene: int = 24
+    seeds: int = 1
+    walks: int = 3
+    max_steps: int = 500
+    megabytes: float = 40.0
+    command: str = ""
+    tell: Callable[[str], None] = field(default=lambda line: None)
+
+
+def open_scenes(runs: Sequence[Run]) -> dict[str, Scene]:
+    """The scenes of all runs, by name.
+
+    Raises:
+        ConfigError: two runs have different scenes of one name.
+        SceneError: a scene is not where it was.
+    """
+    found: dict[str, tuple[Scene, Run]] = {}
+    for run in runs:
+        for scene in SceneSet.open(run.scenes).scenes if run.scenes else ():
+            known, first = found.setdefault(scene.name, (scene, run))
+            if not torch.equal(known.graph, scene.graph):
+                raise ConfigError(
+                    f"{first.folder} and {run.folder} have different scenes called {scene.name!r};"
+                    " report them apart, or rename one (attribute 'scene')"
+                )
+    return {name: scene for name, (scene, _) in found.items()}
+
+
+def tables(runs: Sequence[Run], scenes: Mapping[str, Scene], options: Options) -> dict[str, list[Row]]:
+    """The report's tables by name: summary, seeds, distance, goals, runs.
+
+    Args:
+        runs: what to report.
+        scenes: of :func:`open_scenes`.
+        options: ``within`` is read.
+    """
+    world = SceneSet(scenes.values())
+    return {
+        "summary": summary_rows(runs, options.within),
+        "seeds": seed_rows(runs, options.within),
+        "distance": distance_rows(runs, world, options.within),
+        "goals": goal_rows(runs, options.within),
+        "runs": run_rows(runs),
+    }
+
+
+def goal_limit(states: Sequence[int], agents: int, options: Options) -> int:
+    """Goals of each scene that the explorer can show within the page's weight.
+
+    >>> goal_limit([176, 404, 680, 452], 4, Options())
+    24
+    >>> goal_limit([176, 404, 680, 452], 40, Options(megabytes=10))
+    3
+    """
+    room = options.megabytes * 1e6 * _SHARE_OF_MAPS
+    return max(1, min(options.goals_per_scene, int(room / max(1, sum(states) * agents * _BYTES_A_STATE))))
+
+
+def gather(
+    runs: Sequence[Run], options: Options | None = None
+) -> tuple[dict[str, Any], dict[str, list[Row]]]:
+    """Everything on the page but the pictures (see :func:`add_pictures`).
+
+    Args:
+        runs: what to report, at least one.
+        options: see :class:`Options`.
+
+    Returns:
+        the page's content, plain data, and the tables in it.
+
+    Raises:
+        ConfigError: no runs, or runs that do not fit one another.
+        VusfaError: a scene or a checkpoint that cannot be read.
+    """
+    options = options or Options()
+    if not runs:
+        raise ConfigError("a report needs at least one run; give the folders of runs of recipes/train.py")
+    scenes = open_scenes(runs)
+    options.tell("tables")
+    rows = tables(runs, scenes, options)
+    labels = list(dict.fromkeys(run.label for run in runs))
+    shown = [
+        run
+        for label in labels
+        for run in [run for run in runs if run.label == label and run.checkpoint][: options.seeds]
+    ]
+    limit = goal_limit([scene.num_states for scene in scenes.values()], len(shown), options)
+    goals = {name: _explored_goals(scene, rows["goals"], limit) for name, scene in scenes.items()}
+    options.tell("floor maps")
+    content: dict[str, Any] = {
+        "title": options.title,
+        "command": options.command,
+        "versions": {
+            "vusfa": vusfa.__version__,
+            "torch": torch.__version__,
+            "python": platform.python_version(),
+        },
+        "within": [int(name[8:]) for name in measures(rows["summary"]) if name.startswith("success_")],
+        "measures": measures(rows["summary"]),
+        "models": [{"label": label, "seeds": sum(run.label == label for run in runs)} for label in labels],
+        "tables": {name: rows[name] for name in ("summary", "seeds", "distance", "runs")},
+        "curves": learning_curves(runs),
+        "scenes": {name: floor_plan(scene) for name, scene in scenes.items()},
+        "maps": _success_maps(rows["goals"], scenes, options.within),
+        "goals": goals,
+        "goals_asked": options.goals_per_scene,
+        "agents": [],
+    }
+    for run in shown:
+        options.tell(f"explorer: {run.name}")
+        content["agents"].append(_explored(run, goals, options))
+    return content, rows
+
+
+def add_pictures(content: dict[str, Any], scenes: Mapping[str, Scene], budget: int) -> None:
+    """Put small pictures of the scenes into ``content``, those of goals and walks first.
+
+    Args:
+        content: of :func:`gather`; changed in place.
+        scenes: of :func:`open_scenes`.
+        budget: bytes of base 64 that they may take together, dealt out by the scenes' states.
+    """
+    total = sum(scene.num_states for scene in scenes.values() if scene.has_pictures)
+    for name, scene in scenes.items():
+        walks = [agent["scenes"][name]["walks"] for agent in content["agents"] if name in agent["scenes"]]
+        visited = [state for goals in walks for ways in goals for way in ways for state in way]
+        share = int(budget * scene.num_states / total * 3 / 4) if scene.has_pictures else 0
+        content["scenes"][name]["pictures"] = thumbnails(scene, [*content["goals"][name], *visited], share)
+
+
+def _explored_goals(scene: Scene, rows: Sequence[Row], limit: int) -> list[int]:
+    here = [row for row in rows if row["scene"] == scene.name]
+    success, weight = torch.zeros(scene.num_states), torch.zeros(scene.num_states)
+    for row in here:
+        hardest = min(key for key in row if key.startswith("success_"))
+        success[row["goal"]] += row[hardest] * row["num_episodes"]
+        weight[row["goal"]] += row["num_episodes"]
+    trained = [row["goal"] for row in here if row["trained"]]
+    return choose_goals(scene, trained, success / weight if here else None, limit)
+
+
+def _success_maps(rows: Sequence[Row], scenes: Mapping[str, Scene], within: Sequence[int]) -> list[Row]:
+    """For each model and scene the measures of every state as a goal, packed; the random walk last."""
+    found: dict[tuple[str, str], list[Row]] = {}
+    for row in rows:
+        found.setdefault((row["model"], row["scene"]), []).append(row)
+    maps: list[Row] = []
+    for (label, name), cells in found.items():
+        names = [key for key in cells[0] if key.startswith("success_") or key == "spl"]
+        columns = {key: torch.full((scenes[name].num_states,), torch.nan) for key in names}
+        for cell in cells:
+            for key in names:
+                columns[key][cell["goal"]] = cell[key]
+        maps.append(
+            {"model": label, "scene": name, "trained": [cell["goal"] for cell in cells if cell["trained"]]}
+            | {"episodes": cells[0]["num_episodes"], "seeds": cells[0]["seeds"]}
+            | {key: pack(column, "u8", 0.0, 1.0) for key, column in columns.items()}
+        )
+    for name in dict.fromkeys(scene for _, scene in found):
+        every = torch.arange(scenes[name].num_states)
+        exact = {f"success_{k}": random_walk(scenes[name], every, k) for k in within}
+        maps.append(
+            {"model": "random walk", "scene": name, "trained": [], "episodes": 0, "seeds": 0}
+            | {key: pack(column, "u8", 0.0, 1.0) for key, column in exact.items()}
+        )
+    return maps
+
+
+def _explored(run: Run, goals: Mapping[str, Sequence[int]], options: Options) -> Row:
+    assert run.checkpoint is not None
+    agent, scenes, state = load_agent(run.checkpoint)
+    config, found = agent.config, {}
+    for index, scene in enumerate(scenes.scenes):
+        chosen = goals[scene.name]
+        maps = state_maps(agent, scenes, index, chosen)
+        pairs = [(start, goal) for goal in chosen for start in choose_starts(scene, goal, options.walks)]
+        starts, ends = (scenes.global_id(index, [pair[place] for pair in pairs]) for place in (0, 1))
+        ways = sampled_walks(agent, scenes, starts, ends, options.max_steps, seed=run.seed)
+        by_goal: dict[int, list[list[int]]] = {goal: [] for goal in chosen}
+        for (_, goal), way in zip(pairs, ways, strict=True):
+            by_goal[goal].append(scenes.local_id(way).tolist())
+        found[scene.name] = {
+            "value": pack(maps.value, "u8"),
+            "probabilities": pack(maps.probabilities, "u16", 0.0, 1.0),
+            "components": None if maps.components is None else _symmetric(maps.components),
+            "explained": None if maps.explained is None else maps.explained.tolist(),
+            "walks": list(by_goal.values()),
+        }
+    return {
+        "name": run.name,
+        "model": run.label,
+        "seed": run.seed,
+        "frames": state["frames"],
+        "history": config["history"],
+        "markov": config["history"] == 1 and config["memory"] is None,
+        "trained": {
+            scene.name: scenes.local_id(state["goals"][scenes.scene_id[state["goals"]] == index]).tolist()
+            for index, scene in enumerate(scenes.scenes)
+        },
+        "max_steps": options.max_steps,
+        "scenes": found,
+    }
+
+
+def _symmetric(components: torch.Tensor) -> list[Row]:
+    """One packed (G, N) for each component, its ends the same on either side of 0, the few farthest cut."""
+    packed = []
+    for part in components.unbind(-1):
+        sample = part.abs().flatten()[:: max(1, part.numel() // 100_000)]  # quantile takes no more
+        end = float(torch.quantile(sample, 0.995)) or 1.0
+        packed.append(pack(part, "u8", -end, end))
+    return packed

@@ -1,0 +1,115 @@
+"""Learning curves of several seeds on one axis, with the band that they span."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from vusfa.report.runs import Run
+
+__all__ = ["band", "curve_names", "learning_curves"]
+
+_POINTS = 400  # of a curve on the page; longer logs are thinned
+_PLAIN = (
+    "success",
+    "length",
+    "length_ratio",
+    "collisions",
+    "explained_variance",
+    "entropy",
+    "kl",
+    "loss_critic",
+    "loss_successor",
+    "hindsight_value",
+    "grad_norm",
+)
+_PER_SCENE = ("success", "length", "length_ratio")
+
+
+def curve_names(runs: Sequence[Run]) -> list[str]:
+    """Columns of metrics.csv that the page draws: the general ones that any run logged, and the scenes'.
+
+    >>> from pathlib import Path
+    >>> log = dict.fromkeys(["frames", "success", "scene/hall/success", "lr"], np.ones(1))
+    >>> curve_names([Run("gvf", 0, Path(), {}, log)])
+    ['success', 'scene/hall/success']
+    """
+    logged = dict.fromkeys(name for run in runs for name in run.curves)
+    per_scene = [
+        name for name in logged if name.startswith("scene/") and name.rpartition("/")[2] in _PER_SCENE
+    ]
+    return [name for name in _PLAIN if name in logged] + per_scene
+
+
+def band(
+    curves: Sequence[tuple[np.ndarray, np.ndarray]], points: int = _POINTS
+) -> dict[str, list[float | None]]:
+    """Mean, smallest and largest of several curves, on common frames.
+
+    Each curve is joined by straight lines between its own points, and counts from its first to its last one
+    only.
+
+    Args:
+        curves: pairs of frames (n,), rising, and values (n,); a NaN value is left out.
+        points: at most so many common frames, spread evenly over all that occur.
+
+    Returns:
+        x, mean, low and high, lists of one length; None where no curve has a value.
+
+    >>> one, two = np.array([0.0, 10.0, 20.0]), np.array([0.0, 20.0])
+    >>> found = band([(one, np.array([0.0, 1.0, 2.0])), (two, np.array([4.0, 6.0]))])
+    >>> found["mean"], found["low"]
+    ([2.0, 3.0, 4.0], [0.0, 1.0, 2.0])
+    """
+    known = [(x[np.isfinite(y)], y[np.isfinite(y)]) for x, y in curves]
+    known = [(x, y) for x, y in known if len(x)]
+    if not known:
+        return {"x": [], "mean": [], "low": [], "high": []}
+    grid = np.unique(np.concatenate([x for x, _ in known]))
+    if len(grid) > points:
+        grid = grid[np.unique(np.linspace(0, len(grid) - 1, points).round().astype(int))]
+    values = np.stack([np.interp(grid, x, y, left=np.nan, right=np.nan) for x, y in known])
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # of frames where all are NaN
+        parts = {"mean": np.nanmean(values, 0), "low": np.nanmin(values, 0), "high": np.nanmax(values, 0)}
+    return {"x": grid.tolist(), **{name: _plain(part) for name, part in parts.items()}}
+
+
+def learning_curves(runs: Sequence[Run]) -> list[dict[str, Any]]:
+    """The curves of every model and measure, for the page.
+
+    Args:
+        runs: those without a log are left out.
+
+    Returns:
+        one dictionary for each model and measure: model, name (the column), seeds, and :func:`band`'s lists,
+        against frames; ``minutes``: the same frames as minutes of training, mean of the seeds.
+    """
+    found = []
+    for label in dict.fromkeys(run.label for run in runs):
+        group = [run for run in runs if run.label == label and "frames" in run.curves]
+        for name in curve_names(group):
+            logged = [run.curves for run in group if name in run.curves]
+            drawn = band([(log["frames"], log[name]) for log in logged])
+            found.append(
+                {"model": label, "name": name, "seeds": len(logged), **drawn}
+                | {"minutes": _minutes(logged, drawn["x"])}
+            )
+    return found
+
+
+def _minutes(logs: Sequence[Mapping[str, np.ndarray]], frames: Sequence[float | None]) -> list[float | None]:
+    timed = [log for log in logs if "seconds" in log]
+    if not timed:
+        return [None] * len(frames)
+    grid = np.array(frames, dtype=np.float64)
+    minutes = np.stack([np.interp(grid, log["frames"], log["seconds"]) for log in timed]) / 60
+    return _plain(minutes.mean(0))
+
+
+def _plain(values: np.ndarray) -> list[float | None]:
+    """Five significant digits: what a drawing can show."""
+    return [float(f"{value:.5g}") if np.isfinite(value) else None for value in values]

@@ -1,0 +1,248 @@
+"""What an agent thinks of every state of a scene on the way to a goal, and how it walks there.
+
+For each goal: the value and the policy at every state, the first principal components of psi, and sampled
+walks. An agent with several frames, or with a memory, is asked as it stands when an episode begins there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from tensordict import TensorDict
+from torch import Tensor
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+
+from vusfa.envs.dynamics import Rewards, start_history, step
+from vusfa.evaluation.navigation import Observe
+from vusfa.modules import Agent, frozen
+from vusfa.scenes import Scene, SceneSet
+from vusfa.scenes.poses import spread_poses
+
+__all__ = [
+    "StateMaps",
+    "choose_goals",
+    "choose_starts",
+    "principal_components",
+    "sampled_walks",
+    "state_maps",
+]
+
+_ROWS = 65536  # states and goals that go through the agent at once
+
+
+@dataclass(frozen=True, eq=False)
+class StateMaps:
+    """One agent in one scene of N states, for G goals.
+
+    Args:
+        value: (G, N) V(s, g), in discounted reward.
+        probabilities: (G, N, A) of the policy.
+        components: (G, N, K) psi's first principal components, in the unit of psi; None without psi.
+        explained: (K,) share of psi's variance that each of them holds; None without psi.
+    """
+
+    value: Tensor
+    probabilities: Tensor
+    components: Tensor | None
+    explained: Tensor | None
+
+
+@torch.no_grad()
+def state_maps(
+    agent: Agent, scenes: SceneSet, scene: int, goals: Sequence[int], num_components: int = 3
+) -> StateMaps:
+    """Asks an agent about every state of a scene, for some goals.
+
+    Args:
+        agent: in evaluation mode, on the scenes' device.
+        scenes: the world.
+        scene: index of the scene.
+        goals: G state ids within the scene.
+        num_components: K, at most.
+
+    >>> from vusfa.modules import make_agent
+    >>> scenes = SceneSet.bundled(["bathroom"])
+    >>> maps = state_maps(make_agent("vusfa", scenes=scenes, hidden_size=16).eval(), scenes, 0, [73, 0])
+    >>> maps.value.shape, maps.probabilities.shape, maps.components.shape
+    (torch.Size([2, 176]), torch.Size([2, 176, 4]), torch.Size([2, 176, 3]))
+    """
+    from vusfa.training import make_observation  # it builds on this package's evaluation
+
+    observe = make_observation(agent, scenes)
+    actor, critic = agent.get_policy_operator(), agent.get_value_operator()
+    num_states, device = scenes.scenes[scene].num_states, scenes.device
+    local = torch.arange(num_states, device=device).repeat(len(goals))
+    state = scenes.global_id(scene, local)
+    goal = scenes.global_id(scene, torch.tensor(goals, device=device)).repeat_interleave(num_states)
+    parts: dict[str, list[Tensor]] = {"value": [], "probabilities": [], "psi": []}
+    with frozen(agent), set_exploration_type(ExplorationType.DETERMINISTIC):
+        for rows in torch.arange(len(state), device=device).split(_ROWS):
+            batch = _standing(scenes, state[rows], goal[rows], agent.config["history"], observe)
+            probabilities = actor.get_dist(batch.clone(recurse=False)).probs
+            judged = critic(batch)
+            parts["probabilities"].append(probabilities.float().cpu())
+            parts["value"].append(judged["state_value"].squeeze(-1).float().cpu())
+            if "successor_features" in judged.keys():
+                parts["psi"].append(judged["successor_features"].float().cpu())
+    shape = (len(goals), num_states)
+    components, explained = None, None
+    if parts["psi"]:
+        components, explained = principal_components(torch.cat(parts["psi"]), num_components)
+        components = components.reshape(*shape, -1)
+    return StateMaps(
+        torch.cat(parts["value"]).reshape(shape),
+        torch.cat(parts["probabilities"]).reshape(*shape, -1),
+        components,
+        explained,
+    )
+
+
+def principal_components(values: Tensor, count: int) -> tuple[Tensor, Tensor]:
+    """The first principal components of rows: their coordinates along the directions of largest variance.
+
+    The signs, which are free, are chosen so that the largest coordinate of each is positive.
+
+    Args:
+        values: (n, E).
+        count: K, at most E.
+
+    Returns:
+        (n, K) coordinates about the mean, and (K,) the shares of the variance (0 where there is none).
+
+    >>> line = torch.tensor([[0.0, 0.0], [1.0, 1.0], [2.0, 2.0]])
+    >>> found, share = principal_components(line, 1)
+    >>> [f"{x:.2f}" for x in found.abs().flatten().tolist()], share.tolist()
+    (['1.41', '0.00', '1.41'], [1.0])
+    """
+    centred = values.double() - values.double().mean(0)
+    variances, directions = torch.linalg.eigh(centred.T @ centred)
+    order = variances.argsort(descending=True)[:count]
+    found = centred @ directions[:, order]
+    largest = found.gather(0, found.abs().argmax(0, keepdim=True))
+    total = variances.clamp(min=0).sum()
+    share = variances[order].clamp(min=0) / total if total > 0 else torch.zeros(len(order)).double()
+    return (found * torch.where(largest < 0, -1.0, 1.0)).float(), share.float().clamp(max=1.0)
+
+
+@torch.no_grad()
+def sampled_walks(
+    agent: Agent, scenes: SceneSet, start: Tensor, goal: Tensor, max_steps: int = 500, seed: int = 0
+) -> list[list[int]]:
+    """Walks with actions drawn from the policy, one from every start, and the way of each.
+
+    Args:
+        agent: in evaluation mode, on the scenes' device.
+        scenes: the world.
+        start, goal: (n,) global state ids.
+        max_steps: actions allowed.
+        seed: of the actions; the caller's random state is left as it was.
+
+    Returns:
+        n lists of global state ids, the start first; a walk that arrived ends with its goal.
+
+    >>> from vusfa.modules import make_agent
+    >>> scenes = SceneSet.bundled(["bathroom"])
+    >>> agent = make_agent("gvf", scenes=scenes, hidden_size=16).eval()
+    >>> (walk,) = sampled_walks(agent, scenes, torch.tensor([5]), torch.tensor([9]), max_steps=7)
+    >>> walk[0], len(walk) <= 8
+    (5, True)
+    """
+    from vusfa.training import make_observation
+
+    observe, policy = make_observation(agent, scenes), agent.get_policy_operator()
+    memory_keys = [key[1:] for key in policy.out_keys if isinstance(key, tuple) and key[0] == "next"]
+    device, rewards, memory = scenes.device, Rewards.of(), dict[tuple[str, ...], Tensor]()
+    start, goal = start.to(device), goal.to(device)
+    frames, steps = start_history(start, agent.config["history"]), torch.zeros_like(start).unsqueeze(-1)
+    visited, length = [start], torch.full_like(start, max_steps)
+    devices = [device] if device.type == "cuda" else []
+    with torch.random.fork_rng(devices), frozen(agent), set_exploration_type(ExplorationType.RANDOM):
+        torch.manual_seed(seed)
+        for taken in range(1, max_steps + 1):
+            batch = _batch(scenes, frames, goal)
+            for key, value in memory.items():
+                batch.set(key, value)
+            batch.set("is_init", steps == 0)
+            batch = policy(batch if observe is None else observe(batch))
+            end = step(
+                scenes.successor, scenes.blocked, rewards, max_steps, frames, goal, steps, batch["action"]
+            )
+            frames, steps = end.state_id, end.step_count
+            visited.append(frames[:, -1])
+            length = torch.where(end.terminated.squeeze(-1), length.clamp(max=taken), length)
+            memory = {key: batch.get(("next", *key)) for key in memory_keys}
+            if bool((length <= taken).all()):
+                break
+    ways = torch.stack(visited, 1).tolist()
+    return [way[: end + 1] for way, end in zip(ways, length.tolist(), strict=True)]
+
+
+def choose_goals(scene: Scene, trained: Sequence[int], success: Tensor | None, count: int) -> list[int]:
+    """Which goals of a scene the explorer shows: trained ones, then failures, then poses far apart.
+
+    Args:
+        scene: the scene.
+        trained: state ids of the goals trained on; they come first, sorted.
+        success: (N,) of each state as a goal, NaN where unknown; the lowest fill half of what is left,
+            those of 1 are no failures. None: not known.
+        count: goals in all.
+
+    Returns:
+        state ids without repeats, at most ``count``.
+
+    >>> room = Scene.bundled("bathroom")
+    >>> success = torch.ones(176)
+    >>> success[40] = 0.5
+    >>> choose_goals(room, [73, 0], success, 4)[:3]
+    [0, 73, 40]
+    """
+    chosen = dict.fromkeys(sorted(set(trained))[:count])
+    if success is not None:
+        hardest = torch.nan_to_num(success, nan=2.0).argsort(stable=True).tolist()
+        room = len(chosen) + (count - len(chosen)) // 2
+        for goal in hardest:
+            if len(chosen) >= room or not float(success[goal]) < 1.0:
+                break
+            chosen.setdefault(goal)
+    for goal in spread_poses(scene.location, scene.rotation, scene.num_states):
+        if len(chosen) >= count:
+            break
+        if bool((scene.distance[:, goal] > 0).any()):
+            chosen.setdefault(goal)
+    return list(chosen)
+
+
+def choose_starts(scene: Scene, goal: int, count: int) -> list[int]:
+    """Starts from which a goal can be reached: the farthest one, then nearer ones in even steps.
+
+    >>> room = Scene.bundled("bathroom")
+    >>> starts = choose_starts(room, 73, 3)
+    >>> room.distance[starts, 73].tolist() == sorted(room.distance[starts, 73].tolist(), reverse=True)
+    True
+    """
+    away = scene.distance[:, goal].to(torch.int64)
+    order = away.argsort(descending=True, stable=True)[: int((away > 0).sum())]
+    if not order.numel():
+        return []
+    places = torch.linspace(0, len(order) - 1, count + 1).long()[:count].unique()
+    return order[places].tolist()
+
+
+def _batch(scenes: SceneSet, frames: Tensor, goal: Tensor) -> TensorDict:
+    content = {"state_id": frames, "goal_id": goal, "scene_id": scenes.scene_id[goal]}
+    return TensorDict(content, batch_size=goal.shape, device=scenes.device)
+
+
+def _standing(
+    scenes: SceneSet,
+    state: Tensor,
+    goal: Tensor,
+    history: int,
+    observe: Observe | None,
+) -> Any:
+    batch = _batch(scenes, start_history(state, history), goal)
+    batch.set("is_init", torch.ones_like(state, dtype=torch.bool).unsqueeze(-1))
+    return batch if observe is None else observe(batch)

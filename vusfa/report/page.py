@@ -1,0 +1,96 @@
+"""One HTML file that holds everything it shows: its style, its scripts, Plotly, the numbers, the pictures."""
+
+from __future__ import annotations
+
+import html
+import json
+import math
+import re
+from collections.abc import Mapping, Sequence
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+from vusfa.errors import ConfigError
+from vusfa.evaluation.files import replacing, write_csv
+
+__all__ = ["as_json", "make_page", "page_weight", "write_page", "write_tables"]
+
+_SCRIPTS = ("core.js", "charts.js", "floors.js", "explorer.js", "main.js")
+
+
+def as_json(content: Any) -> str:
+    """JSON that may stand within a ``<script>``; NaN and infinities, which JSON does not have, become null.
+
+    >>> as_json({"a": [math.nan, 0.5], "b": "</script>"})
+    '{"a":[null,0.5],"b":"<\\\\/script>"}'
+    """
+    text = json.dumps(_finite(content), ensure_ascii=False, allow_nan=False, separators=(",", ":"))
+    return text.replace("</", "<\\/").replace("<!--", "<\\u0021--")
+
+
+def make_page(content: Mapping[str, Any]) -> str:
+    """The page's text.
+
+    Args:
+        content: of :func:`vusfa.report.content.gather`, with pictures.
+
+    Raises:
+        ConfigError: Plotly is not installed.
+    """
+    parts = {
+        "title": html.escape(content["title"]),
+        "css": _asset("page.css"),
+        "plotly": _plotly(),
+        "data": as_json(content),
+        "script": "\n".join(_asset(name) for name in _SCRIPTS),
+    }
+    return re.sub(r"\{\{(\w+)\}\}", lambda match: parts[match[1]], _asset("page.html"))
+
+
+def page_weight(content: Mapping[str, Any]) -> int:
+    """Bytes of the page that ``content`` makes."""
+    return len(make_page(content).encode("utf-8"))
+
+
+def write_page(path: str | Path, content: Mapping[str, Any]) -> Path:
+    """Write the page, atomically."""
+    text = make_page(content)
+    with replacing(path) as unfinished:
+        unfinished.write_text(text, encoding="utf-8")
+    return Path(path)
+
+
+def write_tables(folder: str | Path, tables: Mapping[str, Sequence[Mapping[str, Any]]]) -> list[Path]:
+    """Write each table as ``NAME.csv``, atomically; those without rows are left out.
+
+    Returns:
+        the paths.
+    """
+    written = []
+    for name, rows in tables.items():
+        if rows:
+            columns = list(dict.fromkeys(key for row in rows for key in row))
+            padded = [{key: row.get(key, math.nan) for key in columns} for row in rows]
+            written.append(write_csv(Path(folder) / f"{name}.csv", padded, columns))
+    return written
+
+
+def _asset(name: str) -> str:
+    return (files("vusfa.report") / "assets" / name).read_text(encoding="utf-8")
+
+
+def _plotly() -> str:
+    try:
+        from plotly.offline import get_plotlyjs
+    except ImportError as error:
+        raise ConfigError("a report's charts need plotly; pip install 'vusfa[report]'") from error
+    return get_plotlyjs()
+
+
+def _finite(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {key: _finite(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite(item) for item in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value

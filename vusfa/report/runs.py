@@ -1,0 +1,211 @@
+"""Reads the folders that recipes/train.py and recipes/zero_shot.py leave, for a report."""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from vusfa.errors import ConfigError
+from vusfa.evaluation import Episodes
+from vusfa.training import row_name
+
+__all__ = ["Run", "read_curves", "read_episodes", "read_run", "run_label"]
+
+_EVALUATIONS = ("zero_shot", "evaluation")
+_COLUMNS = ("goal", "start", "success", "length", "shortest", "collisions", "trained")
+
+
+@dataclass(frozen=True, eq=False)
+class Run:
+    """One training and what it was worth.
+
+    Args:
+        label: what its model is called on the page; runs of one label are seeds of one thing.
+        seed: of the training.
+        folder: where it was read from.
+        settings: of the training, plain.
+        curves: columns of metrics.csv by name, each (n,) float64 with NaN where nothing was logged.
+        episodes: of its evaluation, or None.
+        references: the evaluation's rows of other policies (random walk, shortest path, ...).
+        checkpoint: path of its weights, or None.
+        variant: how actions were taken in the evaluation: "sampled" or "greedy".
+    """
+
+    label: str
+    seed: int
+    folder: Path
+    settings: Mapping[str, Any]
+    curves: Mapping[str, np.ndarray] = field(default_factory=dict)
+    episodes: Episodes | None = None
+    references: Sequence[Mapping[str, Any]] = ()
+    checkpoint: Path | None = None
+    variant: str = "sampled"
+
+    @property
+    def name(self) -> str:
+        """Label and seed."""
+        return f"{self.label}, seed {self.seed}"
+
+    @property
+    def frames(self) -> float:
+        """Frames trained for, as far as the log tells; NaN without one."""
+        return _last(self.curves, "frames")
+
+    @property
+    def seconds(self) -> float:
+        """Wall-clock seconds of the training, NaN without a log."""
+        return _last(self.curves, "seconds")
+
+    @property
+    def scenes(self) -> list[str]:
+        """Names or files of the scenes it was trained in."""
+        scenes = self.settings.get("scenes", [])
+        return [scenes] if isinstance(scenes, str) else [str(scene) for scene in scenes]
+
+
+def _last(curves: Mapping[str, np.ndarray], name: str) -> float:
+    column = curves.get(name)
+    return float(column[-1]) if column is not None and len(column) else math.nan
+
+
+def read_run(source: str | Path) -> Run:
+    """Reads one run.
+
+    Args:
+        source: its folder; ``LABEL=FOLDER`` calls its model LABEL.
+
+    Raises:
+        ConfigError: no folder, no config.json in it, or a file in it that cannot be read.
+
+    >>> read_run("vusfa=/no/such/folder")
+    Traceback (most recent call last):
+    ...
+    vusfa.errors.ConfigError: /no/such/folder is not a folder; give the folder of a run of recipes/train.py
+    """
+    label, folder = _split(source)
+    if not folder.is_dir():
+        raise ConfigError(f"{folder} is not a folder; give the folder of a run of recipes/train.py")
+    settings = _read_json(folder / "config.json")
+    if not isinstance(settings.get("agent"), Mapping) or "model" not in settings["agent"]:
+        raise ConfigError(
+            f"{folder / 'config.json'}: field 'agent.model' is missing; it is no run's settings"
+        )
+    log, checkpoint = folder / "metrics.csv", folder / "checkpoint.pt"
+    episodes, references, variant = _evaluation(folder)
+    return Run(
+        label or run_label(settings),
+        int(settings.get("seed", 0)),
+        folder,
+        settings,
+        read_curves(log) if log.is_file() else {},
+        episodes,
+        references,
+        checkpoint if checkpoint.is_file() else None,
+        variant,
+    )
+
+
+def run_label(settings: Mapping[str, Any]) -> str:
+    """What a run's model is called when nothing else is said: its row's name in the tables, and its preset
+    unless that is ``controlled``.
+
+    >>> run_label({"agent": {"model": "usfa", "preset": "paper"}})
+    'usfa (paper)'
+    """
+    preset = settings["agent"].get("preset") or "controlled"
+    return row_name(settings) + ("" if preset == "controlled" else f" ({preset})")
+
+
+def read_curves(path: Path) -> dict[str, np.ndarray]:
+    """The columns of a metrics.csv, each (n,) float64; an empty field is NaN.
+
+    Raises:
+        ConfigError: a field that is no number.
+    """
+    with open(path, newline="", encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    names = list(rows[0]) if rows else []
+    try:
+        return {name: np.array([float(row[name] or "nan") for row in rows]) for name in names}
+    except (TypeError, ValueError) as error:
+        raise ConfigError(f"{path}: {error}; it is to hold numbers alone, see docs/training.md") from error
+
+
+def read_episodes(path: Path, max_steps: int) -> Episodes:
+    """An ``..._episodes.csv`` as :class:`~vusfa.evaluation.Episodes` writes it.
+
+    Args:
+        path: the file.
+        max_steps: actions that were allowed in an episode.
+
+    Raises:
+        ConfigError: a column is missing, or holds something else than whole numbers.
+    """
+    with open(path, newline="", encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    missing = [name for name in ("scene", *_COLUMNS) if rows and name not in rows[0]]
+    if missing or not rows:
+        lacks = f"column {missing[0]!r} is missing" if missing else "it has no episodes"
+        raise ConfigError(f"{path}: {lacks}; evaluate the run again with recipes/zero_shot.py")
+    names = tuple(dict.fromkeys(row["scene"] for row in rows))
+    index = {name: place for place, name in enumerate(names)}
+    try:
+        columns = {name: torch.tensor([int(row[name]) for row in rows]) for name in _COLUMNS}
+    except (TypeError, ValueError) as error:
+        raise ConfigError(f"{path}: {error}; evaluate the run again with recipes/zero_shot.py") from error
+    for name in ("success", "trained"):
+        columns[name] = columns[name].to(torch.bool)
+    scene = torch.tensor([index[row["scene"]] for row in rows])
+    return Episodes(scene=scene, **columns, scene_names=names, max_steps=max_steps)
+
+
+def _split(source: str | Path) -> tuple[str, Path]:
+    text = str(source)
+    if "=" in text and not Path(text).exists():
+        label, _, rest = text.partition("=")
+        return label.strip(), Path(rest)
+    return "", Path(text)
+
+
+def _read_json(path: Path) -> dict[str, Any]:
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError as error:
+        raise ConfigError(f"{path} is missing; give the folder of a run of recipes/train.py") from error
+    except (OSError, ValueError) as error:
+        raise ConfigError(f"{path} cannot be read ({error}); write it again") from error
+    if not isinstance(content, dict):
+        raise ConfigError(f"{path} holds no settings; write it again")
+    return content
+
+
+def _evaluation(folder: Path) -> tuple[Episodes | None, list[dict[str, Any]], str]:
+    """Of a run's evaluations the one with the most goals; of equals, recipes/zero_shot.py's."""
+    found: list[tuple[int, Episodes, list[dict[str, Any]], str]] = []
+    for stem in _EVALUATIONS:
+        table, summary = folder / f"{stem}_episodes.csv", folder / f"{stem}.json"
+        if not table.is_file() or not summary.is_file():
+            continue
+        content = _read_json(summary)
+        settings, rows = content.get("settings", {}), content.get("rows", [])
+        episodes = read_episodes(table, int(settings.get("max_steps", 500)))
+        own = rows[0]["policy"] if rows else ""
+        others = [_with_nan(row) for row in rows if row["policy"] != own]
+        variant = "sampled" if settings.get("sample", True) else "greedy"
+        num_goals = int(torch.stack([episodes.scene, episodes.goal]).unique(dim=1).shape[1])
+        found.append((num_goals, episodes, others, variant))
+    if not found:
+        return None, [], "sampled"
+    return max(found, key=lambda item: item[0])[1:]
+
+
+def _with_nan(row: Mapping[str, Any]) -> dict[str, Any]:
+    return {key: math.nan if value is None else value for key, value in row.items()}
