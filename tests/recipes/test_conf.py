@@ -93,11 +93,23 @@ def test_the_command_line_wins_over_the_preset(settings):
 
 
 def test_a_preset_does_not_depend_on_the_one_before(settings):
-    assert settings("preset=controlled", "folder=here") == settings("folder=here")
+    assert settings("preset=fast", "folder=here") == settings("folder=here")
+
+
+def test_fast_is_controlled_but_for_the_clock(settings):
+    """The four models differ in nothing but their ideas: what fast changes, it changes for all of them."""
+    fast, controlled = settings("preset=fast", "folder=here"), settings("preset=controlled", "folder=here")
+    for key in ("objective", "env", "hindsight", "evaluation"):
+        assert fast[key] == controlled[key]
+    changed = {key for key in fast.agent if fast.agent[key] != controlled.agent[key]}
+    assert changed == {"history", "hidden_size", "embedding_size"}
+    assert fast.agent.preset == "controlled"
+    assert (fast.agent.history, fast.collector.rollout, fast.autocast) == (1, 50, True)
+    assert fast.entropy == {"start": 0.01, "end": 0.001, "horizon": 4_000_000}
 
 
 def test_the_numbers_of_controlled(settings):
-    cfg = settings()
+    cfg = settings("preset=controlled")
     assert cfg.optim == {
         "kind": "adam",
         "lr": 5e-4,
@@ -121,6 +133,8 @@ def test_a_chosen_optimiser_comes_with_its_numbers(settings, preset: str, optim:
 @pytest.mark.parametrize("collector", ["single", "multi_sync", "multi_async"])
 def test_a_chosen_collector_comes_with_its_numbers(settings, collector: str):
     chosen = f"collector={collector}"
-    assert settings(chosen).collector == OmegaConf.load(CONF / "collector" / f"{collector}.yaml")
+    assert settings(chosen, "preset=controlled").collector == OmegaConf.load(
+        CONF / "collector" / f"{collector}.yaml"
+    )
     cfg = settings(chosen, "preset=paper", "agent.model=gvf")
     assert (cfg.collector.kind, cfg.collector.num_envs, cfg.collector.rollout) == (collector, 100, 5)
