@@ -1,8 +1,9 @@
-"""One page of what runs learned: python recipes/report.py runs/A runs/B --out report.html
+"""One page of what runs learned: python recipes/report.py runs/A results/table1 --out report.html
 
-RUNS are folders of recipes/train.py, evaluated by it or by recipes/zero_shot.py. NAME=FOLDER calls a model
-NAME; runs of one name are seeds of one thing. The page is a single file that asks for nothing from outside;
-its tables lie beside it as CSV, unrounded, in the folder PAGE_tables, and go to W&B with --wandb.
+SOURCES are folders of recipes/train.py, evaluated by it or by recipes/zero_shot.py; or results: a cell, or an
+experiment with all its cells. NAME=FOLDER calls a model NAME; runs of one name are seeds of one thing. The
+page is a single file that asks for nothing from outside; its tables lie beside it as CSV, unrounded, in the
+folder PAGE_tables, and go to W&B with --wandb.
 """
 
 from __future__ import annotations
@@ -17,13 +18,13 @@ import tyro
 
 from vusfa.errors import VusfaError
 from vusfa.evaluation.files import check_folder
-from vusfa.report import Options, read_run, write_report
+from vusfa.report import Options, read_source, write_report
 from vusfa.training import set_threads
 from vusfa.training.loggers import make_loggers
 
 
 def report(
-    runs: Annotated[list[str], tyro.conf.Positional],
+    sources: Annotated[list[str], tyro.conf.Positional],
     *,
     out: Path = Path("report.html"),
     title: str = "What the runs learned",
@@ -31,21 +32,25 @@ def report(
     seeds: int = 1,
     walks: int = 3,
     max_steps: int = 500,
+    way: Literal["sampled", "greedy"] = "sampled",
+    runs: Path = Path("runs"),
     megabytes: float = 40.0,
     wandb: Literal["online", "offline"] | None = None,
     project: str = "vusfa",
     threads: int = 1,
 ) -> None:
-    """Write a report of runs of recipes/train.py.
+    """Write a report of runs and results.
 
     Args:
-        runs: their folders; NAME=FOLDER calls a model NAME.
+        sources: folders of runs, cells or experiments; NAME=FOLDER calls a model NAME.
         out: the page.
         title: of the page.
         goals_per_scene: goals of each scene in the explorer, at most.
         seeds: runs of each model in the explorer, the first ones given.
         walks: sampled walks to each of these goals.
         max_steps: actions allowed in these walks.
+        way: of the evaluations that results hold.
+        runs: where the trainings of results keep logs and checkpoints, as RUNS/EXPERIMENT/CELL.
         megabytes: what the page may weigh; goals, then pictures are left out to keep it.
         wandb: send the tables to W&B, too; offline leaves them beside the page.
         project: of W&B.
@@ -60,13 +65,13 @@ def report(
         walks=walks,
         max_steps=max_steps,
         megabytes=megabytes,
-        command=shlex.join(["python", "recipes/report.py", *runs, "--out", str(out)]),
+        command=shlex.join(["python", "recipes/report.py", *sources, "--out", str(out)]),
         tell=lambda line: print(line, file=sys.stderr),
     )
-    read = [read_run(run) for run in runs]
+    read = [run for source in sources for run in read_source(source, way, runs)]
     paths, tables = write_report(read, out, options)
     if wandb:
-        kept, made = {"runs": runs, "title": title}, uuid.uuid4().hex[:8]
+        kept, made = {"sources": sources, "title": title}, uuid.uuid4().hex[:8]
         with make_loggers(
             ["wandb"], out.absolute().parent, kept, run_id=made, project=project, mode=wandb, name=title
         ) as loggers:

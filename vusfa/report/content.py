@@ -12,13 +12,14 @@ import torch
 import vusfa
 from vusfa.errors import ConfigError
 from vusfa.evaluation import random_walk
+from vusfa.report.by_goal import distance_rows, goal_rows
 from vusfa.report.curves import learning_curves
 from vusfa.report.explorer import choose_goals, choose_starts, sampled_walks, state_maps
 from vusfa.report.geometry import floor_plan
 from vusfa.report.packing import pack
 from vusfa.report.pictures import thumbnails
 from vusfa.report.runs import Run
-from vusfa.report.tables import distance_rows, goal_rows, measures, run_rows, seed_rows, summary_rows
+from vusfa.report.tables import measures, reference_rows, run_rows, seed_rows, summary_rows
 from vusfa.scenes import Scene, SceneSet
 from vusfa.training import load_agent
 
@@ -85,8 +86,11 @@ def tables(runs: Sequence[Run], scenes: Mapping[str, Scene], options: Options) -
         options: ``within`` is read.
     """
     world = SceneSet(scenes.values())
+    beside: list[Row] = []
+    if not any(run.references for run in runs):
+        beside = [row for run in runs if run.episodes for row in reference_rows(run, world, options.within)]
     return {
-        "summary": summary_rows(runs, options.within),
+        "summary": summary_rows(runs, options.within, beside),
         "seeds": seed_rows(runs, options.within),
         "distance": distance_rows(runs, world, options.within),
         "goals": goal_rows(runs, options.within),
@@ -196,11 +200,12 @@ def _success_maps(rows: Sequence[Row], scenes: Mapping[str, Scene], within: Sequ
         found.setdefault((row["model"], row["scene"]), []).append(row)
     maps: list[Row] = []
     for (label, name), cells in found.items():
-        names = [key for key in cells[0] if key.startswith("success_") or key == "spl"]
+        known = dict.fromkeys(key for cell in cells for key in cell)
+        names = [key for key in known if key.startswith(("success_", "exact_1", "exact_5")) or key == "spl"]
         columns = {key: torch.full((scenes[name].num_states,), torch.nan) for key in names}
         for cell in cells:
             for key in names:
-                columns[key][cell["goal"]] = cell[key]
+                columns[key][cell["goal"]] = cell.get(key, torch.nan)
         maps.append(
             {"model": label, "scene": name, "trained": [cell["goal"] for cell in cells if cell["trained"]]}
             | {"episodes": cells[0]["num_episodes"], "seeds": cells[0]["seeds"]}
@@ -209,6 +214,7 @@ def _success_maps(rows: Sequence[Row], scenes: Mapping[str, Scene], within: Sequ
     for name in dict.fromkeys(scene for _, scene in found):
         every = torch.arange(scenes[name].num_states)
         exact = {f"success_{k}": random_walk(scenes[name], every, k) for k in within}
+        exact |= {name.replace("success", "exact"): column for name, column in exact.items()}
         maps.append(
             {"model": "random walk", "scene": name, "trained": [], "episodes": 0, "seeds": 0}
             | {key: pack(column, "u8", 0.0, 1.0) for key, column in exact.items()}

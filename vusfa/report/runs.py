@@ -15,9 +15,10 @@ import torch
 
 from vusfa.errors import ConfigError
 from vusfa.evaluation import Episodes
+from vusfa.evaluation.exact import ExactGoals
 from vusfa.training import row_name
 
-__all__ = ["Run", "read_curves", "read_episodes", "read_run", "run_label"]
+__all__ = ["Run", "read_curves", "read_episodes", "read_run", "run_label", "split_name"]
 
 _EVALUATIONS = ("zero_shot", "evaluation")
 _COLUMNS = ("goal", "start", "success", "length", "shortest", "collisions", "trained")
@@ -37,6 +38,8 @@ class Run:
         references: the evaluation's rows of other policies (random walk, shortest path, ...).
         checkpoint: path of its weights, or None.
         variant: how actions were taken in the evaluation: "sampled" or "greedy".
+        exact: its goals' exact chances, or None.
+        told: frames and seconds of the training, where there is no log to tell.
     """
 
     label: str
@@ -48,6 +51,8 @@ class Run:
     references: Sequence[Mapping[str, Any]] = ()
     checkpoint: Path | None = None
     variant: str = "sampled"
+    exact: ExactGoals | None = None
+    told: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def name(self) -> str:
@@ -56,13 +61,13 @@ class Run:
 
     @property
     def frames(self) -> float:
-        """Frames trained for, as far as the log tells; NaN without one."""
-        return _last(self.curves, "frames")
+        """Frames trained for; NaN where nothing tells."""
+        return self.told.get("frames", _last(self.curves, "frames"))
 
     @property
     def seconds(self) -> float:
-        """Wall-clock seconds of the training, NaN without a log."""
-        return _last(self.curves, "seconds")
+        """Wall-clock seconds of the training; NaN where nothing tells."""
+        return self.told.get("seconds", _last(self.curves, "seconds"))
 
     @property
     def scenes(self) -> list[str]:
@@ -90,7 +95,7 @@ def read_run(source: str | Path) -> Run:
     ...
     vusfa.errors.ConfigError: /no/such/folder is not a folder; give the folder of a run of recipes/train.py
     """
-    label, folder = _split(source)
+    label, folder = split_name(source)
     if not folder.is_dir():
         raise ConfigError(f"{folder} is not a folder; give the folder of a run of recipes/train.py")
     settings = _read_json(folder / "config.json")
@@ -167,7 +172,12 @@ def read_episodes(path: Path, max_steps: int) -> Episodes:
     return Episodes(scene=scene, **columns, scene_names=names, max_steps=max_steps)
 
 
-def _split(source: str | Path) -> tuple[str, Path]:
+def split_name(source: str | Path) -> tuple[str, Path]:
+    """``NAME=FOLDER`` as both; the name is empty where none is given.
+
+    >>> split_name("ours=runs/a")
+    ('ours', PosixPath('runs/a'))
+    """
     text = str(source)
     if "=" in text and not Path(text).exists():
         label, _, rest = text.partition("=")

@@ -87,9 +87,9 @@ const TITLES = {
   length_ratio: "Length over shortest path",
   collisions: "Blocked actions (an episode)",
 };
-const isShare = (name) => name.startsWith("success_") || name === "spl";
+const isShare = (name) => name.startsWith("success_") || name.startsWith("exact_") || name === "spl";
 const headOf = (name) => HEADS[name] || `within ${name.slice(8)}`;
-const titleOf = (name) => TITLES[name] || `Goals reached within ${name.slice(8)} actions (%)`;
+const titleOf = (name) => TITLES[name] || (name.startsWith("exact_") ? `Exact chance of reaching it within ${name.slice(6)} actions (%)` : `Goals reached within ${name.slice(8)} actions (%)`);
 const words = (name) => String(name).replaceAll("_", " ");
 const known = (value) => value !== null && value !== undefined && Number.isFinite(value);
 

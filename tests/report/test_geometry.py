@@ -1,0 +1,55 @@
+"""Floor plans: slices that share a square between them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from vusfa.report.geometry import floor_plan, slices
+from vusfa.report.packing import unpack
+from vusfa.scenes import Scene
+
+
+@pytest.mark.parametrize(
+    "headings", [[0, 90, 180, 270], [30, 45, 200], [350, 10], [0, 45, 90, 135, 180, 225, 270, 315]]
+)
+def test_slices_go_once_around_and_hold_their_headings(headings: list[float]):
+    rotation = np.array(headings, dtype=float)
+    centre, first, last = slices(np.tile([2.0, 3.0], (len(headings), 1)), rotation)
+    assert (centre == [2.0, 3.0]).all()
+    assert (last - first).sum() == pytest.approx(360)
+    for angle in np.arange(0.3, 360, 1.0):
+        inside = np.mod(angle - first, 360) < last - first
+        assert inside.sum() == 1
+        nearest = np.abs((rotation - angle + 180) % 360 - 180).argmin()
+        assert inside[nearest]
+
+
+def test_one_heading_has_the_whole_square():
+    _, first, last = slices(np.array([[0.0, 0.0], [1.0, 0.0]]), np.array([90.0, 0.0]))
+    assert (last - first).tolist() == [360, 360]
+
+
+def test_the_same_pose_twice_is_laid_out():
+    centre, first, last = slices(np.zeros((5, 2)), np.zeros(5))
+    assert len(np.unique(centre, axis=0)) == 5
+    assert ((last - first) == 360).all()
+
+
+def test_a_plan_is_the_scene(make_scene):
+    scene: Scene = make_scene("hall", 3, 2)
+    plan = floor_plan(scene)
+    assert (plan["name"], plan["states"], plan["cell"], plan["metric"]) == ("hall", 24, 0.5, True)
+    assert torch.allclose(torch.tensor([plan["x"], plan["z"]]).T, scene.location)
+    assert plan["heading"] == scene.rotation.tolist()
+    leads = torch.from_numpy(unpack(plan["next"]))
+    blocked = scene.graph < 0
+    assert (leads[~blocked] == scene.graph[~blocked]).all()
+    assert (leads == torch.arange(24)[:, None])[blocked].all()
+
+
+def test_a_scene_without_places(make_scene):
+    plan = floor_plan(Scene("nowhere", make_scene().graph, make_scene().features))
+    assert not plan["metric"]
+    assert len(set(zip(plan["x"], plan["z"], strict=True))) == 16
