@@ -9,7 +9,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from vusfa.evaluation.metrics import length_ratio, spl, success_rate, weighted_mean
+from vusfa.evaluation.metrics import length_ratio, soft_spl, spl, success_rate, weighted_mean
 
 EPISODE = st.tuples(st.booleans(), st.integers(1, 40), st.integers(1, 40))
 
@@ -23,6 +23,14 @@ def test_hand_computed():
     assert success_rate(success, length, 9) == 0.25
     assert spl(success, length, shortest) == pytest.approx((1 + 0.5 + 0.2 + 0) / 4)
     assert length_ratio(success, length, shortest) == pytest.approx(115 / 30)
+
+
+def test_soft_spl_counts_the_way_that_is_done():
+    length = torch.tensor([5, 10, 500, 500, 500, 500])
+    shortest = torch.tensor([5, 5, 20, 20, -1, 20])
+    remaining = torch.tensor([0, 0, 5, 30, -1, -1])  # there, there, nearer, farther, no path, no path left
+    expected = (1 + 0.5 + 0.75 * 20 / 500 + 0 + 0 + 0) / 6
+    assert soft_spl(length, shortest, remaining) == pytest.approx(expected)
 
 
 def test_without_episodes_or_success_there_is_no_number():

@@ -175,6 +175,7 @@ def test_compare_puts_everything_side_by_side(rooms: SceneSet, policies, tmp_pat
         "shortest",
         "collisions",
         "trained",
+        "remaining",
     }
     assert {row["trained"] for row in walked} == {"0", "1"}
 

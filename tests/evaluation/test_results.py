@@ -33,8 +33,18 @@ def test_comes_back_as_it_was(tmp_path: Path, cell: Cell) -> None:
     assert again.info == cell.info
     assert list(again.episodes) == ["sampled", "greedy"]
     assert again.episodes["sampled"].equal(cell.episodes["sampled"])
+    assert again.episodes["sampled"].remaining is None
     assert again.exact is not None
     torch.testing.assert_close(again.exact.spl, cell.exact.spl if cell.exact else None)
+
+
+def test_what_remained_comes_back(tmp_path: Path, cell: Cell) -> None:
+    table = cell.episodes["sampled"]
+    kept = Episodes(**{**vars(table), "remaining": table.shortest - 1})
+    write_cell(tmp_path, Cell("a", "b", {}, {"sampled": kept}))
+    again = read_cell(tmp_path, "a", "b").episodes["sampled"]
+    assert again.equal(kept)
+    assert not again.equal(table)
 
 
 def test_numbers_are_small_on_disk(tmp_path: Path, cell: Cell) -> None:

@@ -67,12 +67,12 @@ def test_a_cell_is_run_once_and_again_gives_the_same(
 def test_a_cell_goes_on_where_it_was_cut_off(
     table1: Any, folders: dict[str, Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(table1, "validation_score", _interrupt)
+    monkeypatch.setattr(table1, "choose_checkpoint", _interrupt)
     with pytest.raises(KeyboardInterrupt):
         table1.table1(SMALL, models=["gvf"], seeds=[1], **folders)
     assert read_cells(folders["results"], "table1") == []
     monkeypatch.setattr(table1, "train", None)  # nothing is trained twice
-    monkeypatch.setattr(table1, "validation_score", lambda path, manifest: float(path.stem[-2:]))
+    monkeypatch.setattr(table1, "choose_checkpoint", lambda paths, manifest: {paths[1]: 0.5, paths[0]: 0.4})
     table1.table1(SMALL, models=["gvf"], seeds=[1], **folders)
     cell = read_cell(folders["results"], "table1", "gvf-1")
     assert (cell.info["seed"], cell.info["checkpoint"]) == (1, "checkpoint-90.pt")

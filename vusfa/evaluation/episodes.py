@@ -32,6 +32,8 @@ class Episodes:
         trained: bool, the goal is one of those the agent was trained on.
         scene_names: names of the scenes.
         max_steps: actions allowed in an episode.
+        remaining: int64, fewest actions from where it ended to the goal: 0 at the goal, -1 where no path is
+            left; None for a table from before this was kept.
 
     >>> one = torch.tensor([1])
     >>> table = Episodes(one * 0, one, one * 2, one > 0, one * 5, one * 4, one * 0, one > 0, ("hall",), 500)
@@ -49,33 +51,42 @@ class Episodes:
     trained: Tensor
     scene_names: tuple[str, ...]
     max_steps: int
+    remaining: Tensor | None = None
 
     def __post_init__(self) -> None:
-        shapes = {name: tuple(getattr(self, name).shape) for name in _COLUMNS}
+        shapes = {name: tuple(getattr(self, name).shape) for name in self.columns}
         if len(set(shapes.values())) != 1 or self.scene.ndim != 1:
             raise ValueError(f"the columns of a table of episodes must all be (n,); they are {shapes}")
+
+    @property
+    def columns(self) -> tuple[str, ...]:
+        """Names of the columns that it has."""
+        return _COLUMNS if self.remaining is None else (*_COLUMNS, "remaining")
 
     def __len__(self) -> int:
         return self.scene.shape[0]
 
     def select(self, rows: Tensor) -> Episodes:
         """The episodes where ``rows`` (n,) bool is set."""
-        return replace(self, **{name: getattr(self, name)[rows] for name in _COLUMNS})
+        return replace(self, **{name: getattr(self, name)[rows] for name in self.columns})
 
     def rows(self) -> Iterator[dict[str, Any]]:
         """One dictionary an episode, with the scene's name and plain Python values."""
-        columns = [getattr(self, name).tolist() for name in _COLUMNS]
+        columns = [getattr(self, name).tolist() for name in self.columns]
         for values in zip(*columns, strict=True):
-            row = dict(zip(_COLUMNS, values, strict=True))
+            row = dict(zip(self.columns, values, strict=True))
             row["scene"] = self.scene_names[row["scene"]]
             yield row
 
     def write_csv(self, path: str | Path) -> Path:
         """Write one line an episode, atomically; truth values as 0 and 1."""
         rows = ({k: int(v) if isinstance(v, bool) else v for k, v in row.items()} for row in self.rows())
-        return write_csv(path, rows, _COLUMNS)
+        return write_csv(path, rows, self.columns)
 
     def equal(self, other: Episodes) -> bool:
         """Whether both tables hold the same numbers."""
         pairs = ((getattr(self, f.name), getattr(other, f.name)) for f in fields(self))
-        return all(torch.equal(a, b) if isinstance(a, Tensor) else a == b for a, b in pairs)
+        return all(
+            torch.equal(a, b) if isinstance(a, Tensor) and isinstance(b, Tensor) else a is b or a == b
+            for a, b in pairs
+        )

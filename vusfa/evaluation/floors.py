@@ -59,4 +59,5 @@ def shortest_paths(episodes: Episodes) -> Episodes:
         success=possible,
         length=torch.where(possible, episodes.shortest, episodes.max_steps),
         collisions=torch.zeros_like(episodes.collisions),
+        remaining=torch.where(possible, 0, episodes.shortest),
     )

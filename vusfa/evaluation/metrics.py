@@ -6,6 +6,8 @@ The measures and their sources:
 - success within k steps: the agent stood on the goal after at most k actions.
 - SPL, success weighted by path length (Anderson et al. 2018, arXiv 1807.06757, eq. 1), counted in actions
   instead of metres: the mean over episodes of ``success * shortest / max(length, shortest)``.
+- soft-SPL (Datta et al. 2020, arXiv 2009.03231, sec. 4): success is replaced by the share of the way to the
+  goal that is behind the agent when the episode ends, ``max(0, 1 - remaining / shortest)``.
 - length over shortest path: mean length of the successful episodes over the mean of their shortest paths. A
   ratio of means, not a mean of ratios: in the latter an episode that starts beside its goal weighs as much as
   a long one.
@@ -19,7 +21,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-__all__ = ["length_ratio", "spl", "success_rate", "weighted_mean"]
+__all__ = ["length_ratio", "soft_spl", "spl", "success_rate", "weighted_mean"]
 
 
 def success_rate(success: Tensor, length: Tensor, within: int) -> float:
@@ -50,6 +52,23 @@ def spl(success: Tensor, length: Tensor, shortest: Tensor) -> float:
     best = shortest.to(torch.float64)
     taken = torch.maximum(length.to(torch.float64), best)
     return torch.where(success, best / taken, 0.0).mean().item()
+
+
+def soft_spl(length: Tensor, shortest: Tensor, remaining: Tensor) -> float:
+    """SPL with progress instead of success (Datta et al. 2020), in actions, NaN without episodes.
+
+    Args:
+        length: (n,) actions taken.
+        shortest: (n,) fewest actions possible, -1 where there is no path (such an episode counts 0).
+        remaining: (n,) fewest actions from where it ended to the goal, -1 where no path is left.
+
+    >>> soft_spl(torch.tensor([8, 8, 8]), torch.tensor([4, 4, 4]), torch.tensor([0, 1, 7]))
+    0.2916666666666667
+    """
+    best = shortest.to(torch.float64)
+    progress = (1 - remaining / best.clamp(min=1)).clamp(min=0)
+    scores = progress * best / torch.maximum(length.to(torch.float64), best)
+    return torch.where((best > 0) & (remaining >= 0), scores, 0.0).mean().item()
 
 
 def length_ratio(success: Tensor, length: Tensor, shortest: Tensor) -> float:

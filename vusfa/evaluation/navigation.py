@@ -153,7 +153,7 @@ def evaluate(
         frozen(policy),
     ):
         torch.manual_seed(seed)
-        success, length, collisions = walk(
+        success, length, collisions, end = walk(
             policy,
             scenes,
             start,
@@ -178,6 +178,7 @@ def evaluate(
         trained=marked[goal],
         scene_names=tuple(scenes.names),
         max_steps=max_steps,
+        remaining=scenes.distance(end, goal).cpu(),
     )
 
 
@@ -193,7 +194,7 @@ def walk(
     batch_size: int = 4096,
     observe: Observe | None = None,
     progress: Progress | None = None,
-) -> tuple[Tensor, Tensor, Tensor]:
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Walks one episode from every start to its goal, in the exploration mode and from the random state in
     force.
 
@@ -206,7 +207,8 @@ def walk(
         goal: (n,) global state ids.
 
     Returns:
-        success (n,) bool, length (n,) int64 and collisions (n,) int64, on the CPU.
+        success (n,) bool, length (n,) int64, collisions (n,) int64 and the state (n,) int64 where each ended,
+        a global id; all on the CPU.
     """
     if max_steps < 1 or batch_size < 1:
         raise ConfigError(f"max_steps is {max_steps} and batch_size {batch_size}; both must be 1 or more")
@@ -216,6 +218,7 @@ def walk(
     success = torch.zeros(total, dtype=torch.bool, device=device)
     length = torch.full((total,), max_steps, dtype=torch.int64, device=device)
     collisions = torch.zeros(total, dtype=torch.int64, device=device)
+    last = start.clone()
     memory_keys = [key[1:] for key in policy.out_keys if isinstance(key, tuple) and key[0] == "next"]
 
     rewards = Rewards.of()
@@ -249,6 +252,7 @@ def walk(
         frames, steps = end.state_id, end.step_count
         success[row] = end.terminated.squeeze(-1)
         length[row] = steps.squeeze(-1)
+        last[row] = frames[:, -1]
         collisions.index_add_(0, row, end.collided.squeeze(-1).to(torch.int64))
         memory = {key: batch.get(("next", *key)) for key in memory_keys}
 
@@ -265,7 +269,7 @@ def walk(
             }
         if progress is not None:
             progress(begun - row.shape[0], total)
-    return success.cpu(), length.cpu(), collisions.cpu()
+    return success.cpu(), length.cpu(), collisions.cpu(), last.cpu()
 
 
 @contextmanager

@@ -14,7 +14,7 @@ from __future__ import annotations
 import json
 import shutil
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -78,9 +78,9 @@ def write_cell(root: str | Path, cell: Cell) -> Path:
         told = {"scenes": list(scenes), "max_steps": steps, "episodes": list(tables)} if tables else {}
         write_json(unfinished / "cell.json", {"info": dict(cell.info), **told})
         for name, table in cell.episodes.items():
-            _write_columns(unfinished / f"{name}.npz", table, Episodes)
+            _write_columns(unfinished / f"{name}.npz", table, table.columns)
         if cell.exact is not None:
-            _write_columns(unfinished / f"{_EXACT}.npz", cell.exact, ExactGoals)
+            _write_columns(unfinished / f"{_EXACT}.npz", cell.exact, _columns(ExactGoals))
         if folder.exists():
             shutil.rmtree(folder)
         unfinished.rename(folder)
@@ -134,8 +134,8 @@ def _columns(table: type) -> list[str]:
     return [field.name for field in fields(table) if field.type in ("Tensor", Tensor)]
 
 
-def _write_columns(path: Path, table: Any, kind: type) -> None:
-    columns = {name: _small(getattr(table, name).numpy()) for name in _columns(kind)}
+def _write_columns(path: Path, table: Any, names: Sequence[str]) -> None:
+    columns = {name: _small(getattr(table, name).numpy()) for name in names}
     np.savez_compressed(path, allow_pickle=False, **columns)
 
 
@@ -153,7 +153,8 @@ def _read_columns(path: Path, kind: type) -> dict[str, Tensor]:
     missing = [name for name in _columns(kind) if name not in content]
     if missing:
         raise ResultError(f"{path}: the column {missing[0]!r} is missing; run this cell again")
-    columns = {name: content[name] for name in _columns(kind)}
+    known = {field.name for field in fields(kind)}
+    columns = {name: column for name, column in content.items() if name in known}
     types = {"b": torch.bool, "f": torch.float64}
     return {
         name: torch.from_numpy(np.ascontiguousarray(column)).to(types.get(column.dtype.kind, torch.int64))

@@ -1,0 +1,108 @@
+"""From checkpoints to a cell of results: which checkpoint counts, and what it is worth."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import torch
+
+from vusfa.evaluation import Episodes, evaluate
+from vusfa.evaluation.exact import agent_probabilities, exact_goals
+from vusfa.evaluation.manifest import BUNDLED_MANIFEST, Manifest, make_manifest, read_manifest
+from vusfa.evaluation.metrics import spl
+from vusfa.evaluation.results import Cell
+from vusfa.modules import Agent
+from vusfa.scenes import SceneSet
+from vusfa.training.facts import run_facts
+from vusfa.training.progress import EvaluationProgress
+from vusfa.training.session import load_agent, make_observation
+
+__all__ = ["choose_checkpoint", "manifest_for", "measure_checkpoint", "walk_manifest"]
+
+WAYS = ("sampled", "greedy")
+
+
+def manifest_for(scenes: SceneSet, trained: torch.Tensor, path: Path | None = None) -> Manifest:
+    """The named manifest of episodes; when none is named the bundled rooms' own, or for other rooms one made
+    by :func:`~vusfa.evaluation.manifest.make_manifest`."""
+    manifest = read_manifest(path or BUNDLED_MANIFEST)
+    return manifest if path or manifest.fingerprint == scenes.fingerprint else make_manifest(scenes, trained)
+
+
+def choose_checkpoint(checkpoints: Sequence[Path], manifest: Path | None = None) -> dict[Path, float]:
+    """SPL over the episodes to the validation goals, actions drawn; the rule is to take the best, the earlier
+    one of equals.
+
+    Args:
+        checkpoints: of one training.
+        manifest: see :func:`manifest_for`.
+
+    Returns:
+        each one's, best first.
+    """
+    scores = {}
+    for path in checkpoints:
+        agent, scenes, state = load_agent(path)
+        episodes = manifest_for(scenes, state["goals"], manifest)
+        table = walk_manifest(agent, scenes, episodes, state["goals"], path.stem, validation=True)
+        scores[path] = spl(table.success, table.length, table.shortest)
+    return dict(sorted(scores.items(), key=lambda item: -item[1]))
+
+
+def measure_checkpoint(
+    checkpoint: Path, experiment: str, name: str, overrides: Sequence[str] = (), manifest: Path | None = None
+) -> Cell:
+    """A cell: the manifest's episodes with actions drawn and with the likeliest ones, and the exact table
+    where the agent sees one frame.
+
+    Args:
+        checkpoint: of recipes/train.py.
+        experiment, name: of the cell.
+        overrides: what the training was started with.
+        manifest: see :func:`manifest_for`.
+    """
+    agent, scenes, state = load_agent(checkpoint)
+    episodes, trained = manifest_for(scenes, state["goals"], manifest), state["goals"]
+    tables = {
+        way: walk_manifest(agent, scenes, episodes, trained, f"{name}, {way}", way == "sampled")
+        for way in WAYS
+    }
+    exact, config = None, agent.config
+    if config["history"] == 1 and config["observation"] == "index" and config["memory"] is None:
+        exact = exact_goals(agent_probabilities(agent.eval()), scenes, agent)
+    info = {**run_facts(state, overrides), "checkpoint": checkpoint.name}
+    return Cell(experiment, name, info, tables, exact)
+
+
+def walk_manifest(
+    agent: Agent,
+    scenes: SceneSet,
+    manifest: Manifest,
+    trained: torch.Tensor,
+    title: str,
+    sample: bool = True,
+    validation: bool = False,
+) -> Episodes:
+    """A manifest's episodes, walked by an agent.
+
+    Args:
+        agent, scenes: who walks where.
+        manifest: of episodes.
+        trained: global ids of the goals trained on.
+        title: for the line of progress.
+        sample: draw actions, or take the likeliest.
+        validation: walk the episodes that checkpoints are chosen by, instead of those to report.
+    """
+    with EvaluationProgress() as progress:
+        return evaluate(
+            agent.get_policy_operator(out_keys=["action"]),
+            scenes,
+            episodes=manifest.episodes(scenes, validation),
+            trained=trained,
+            sample=sample,
+            seed=manifest.seed,
+            history=agent.config["history"],
+            observe=make_observation(agent, scenes),
+            progress=lambda done, total: progress(title, done, total),
+        )
