@@ -1,0 +1,38 @@
+"""recipes/report.py from the command line."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+REPORT = Path(__file__).parents[2] / "recipes" / "report.py"
+
+
+def call(*arguments: object) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, str(REPORT), *map(str, arguments)], capture_output=True, text=True, check=False
+    )
+
+
+def test_page_tables_and_wandb(run_folders: list[Path], tmp_path: Path, wandb_content):
+    options = ["--goals-per-scene", 2, "--walks", 1, "--max-steps", 5, "--wandb", "offline"]
+    done = call(f"ours={run_folders[0]}", run_folders[2], "--out", tmp_path / "page.html", *options)
+    assert done.returncode == 0, done.stderr
+    paths = [Path(line) for line in done.stdout.splitlines()]
+    assert paths[0] == tmp_path / "page.html"
+    assert all(path.is_file() for path in paths)
+    assert (tmp_path / "page_tables" / "summary.csv").read_text().splitlines()[1].startswith("ours,model,")
+    (log,) = (tmp_path / "wandb").glob("offline-run-*/*.wandb")
+    sent = wandb_content(log)
+    for name in (b"summary", b"seeds", b"distance", b"goals", b"runs"):
+        assert b"table/" + name in sent
+
+
+def test_faults_in_one_line(tmp_path: Path):
+    done = call(tmp_path / "none", "--out", tmp_path / "page.html")
+    assert done.returncode == 1
+    assert (
+        done.stderr == f"error: {tmp_path / 'none'} is not a folder; give the folder of a run or of results\n"
+    )
+    assert not list(tmp_path.iterdir())
