@@ -293,3 +293,17 @@ def test_pictures_of_different_sizes_or_none(make_file: Callable[..., Path], pic
     for ids in ([1, 11], [11], [11, 1]):
         with pytest.raises(SceneError, match="scene 'blind' has no pictures"):
             together.pictures(ids)
+
+
+def test_files_whose_scenes_are_called_alike_are_called_by_their_files_names(
+    scene_file: Path, tmp_path: Path
+) -> None:
+    """Rooms of one kind that are rendered from several seeds all call themselves by their kind."""
+    paths = [tmp_path / "room-1.h5", tmp_path / "room-2.h5"]
+    for path in paths:
+        path.write_bytes(scene_file.read_bytes())
+    assert SceneSet.open(paths).names == ("room-1", "room-2")
+    alone = Scene.load(scene_file).name
+    assert SceneSet.open([paths[0]]).names == (alone,)
+    with pytest.raises(SceneError, match="2 scenes are called 'room-1'"):
+        SceneSet.open([paths[0], paths[0]])

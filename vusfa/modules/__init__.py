@@ -8,7 +8,7 @@
 """
 
 from vusfa.modules.acting import ActingPolicy, action_logits, draw_actions
-from vusfa.modules.agents import Agent, make_agent
+from vusfa.modules.agents import Agent, make_agent, transplant
 from vusfa.modules.bottleneck import GaussianEncoder, LatentSampler
 from vusfa.modules.frames import FeatureFrames, PictureFrames
 from vusfa.modules.linear import HistoryLinear, SceneLinear
@@ -45,4 +45,5 @@ __all__ = [
     "frozen",
     "make_agent",
     "resolve_config",
+    "transplant",
 ]

@@ -107,7 +107,7 @@ class ActingPolicy(TensorDictModuleBase):
             "scene_id",
         ]
         self.out_keys = ["action"]
-        self._num_scenes = len(agent.config["scenes"])
+        self._num_scenes = agent.scene_layer.linear.num_scenes  # that have weights of their own
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Adds ``action``, (\\*B,) int64."""

@@ -36,7 +36,7 @@ from vusfa.modules.siamese import NormalisedEncoder, SiameseEncoder
 from vusfa.modules.successor import RewardHead, SuccessorHead, SuccessorValue, ValueHead
 from vusfa.modules.trunk import Fusion, SceneLayer, SiameseTrunk
 
-__all__ = ["Agent", "make_agent"]
+__all__ = ["Agent", "make_agent", "transplant"]
 
 
 def make_agent(model: str, preset: str = "controlled", scenes: Any = None, **overrides: Any) -> Agent:
@@ -46,7 +46,8 @@ def make_agent(model: str, preset: str = "controlled", scenes: Any = None, **ove
         model: ``"gvf"`` (Zhu et al. 2017), ``"usfa"``, ``"sfdp"`` or ``"vusfa"``.
         preset: ``"controlled"`` (the models differ only in the named ideas), ``"paper"`` (the text) or
             ``"reference"`` (the released code with its quirks).
-        scenes: the :class:`vusfa.scenes.SceneSet` to live in; it gives the features, and one head a scene.
+        scenes: the :class:`vusfa.scenes.SceneSet` to live in; it gives the features, and one head a scene
+            unless ``shared_heads=True``.
         overrides: fields of :class:`~vusfa.modules.presets.AgentConfig`, such as ``history=1`` or
             ``memory="lstm"``.
 
@@ -65,6 +66,48 @@ def make_agent(model: str, preset: str = "controlled", scenes: Any = None, **ove
             "make_agent needs scenes=...; SceneSet.bundled() gives the four that come with the package"
         )
     return Agent(config, scenes)
+
+
+def transplant(agent: Agent, scenes: Any) -> Agent:
+    """A copy of an agent with ``shared_heads`` that lives in other scenes, with the same weights.
+
+    It looks at the new scenes as at those it was trained in: features are normalised by the mean and
+    deviation of the TRAINING scenes, which are among its weights. For equal features it gives equal numbers.
+
+    Args:
+        agent: built with ``shared_heads=True``.
+        scenes: a ``SceneSet`` with features of the same size and as many actions.
+
+    Returns:
+        an agent on the same device, training or evaluating as the given one does. No tensor is shared.
+
+    Raises:
+        ConfigError: the agent has heads of its own for each scene, or the scenes do not fit it.
+
+    >>> from vusfa.scenes import SceneSet
+    >>> home, other = SceneSet.bundled(["bathroom"]), SceneSet.bundled(["kitchen", "bedroom"])
+    >>> agent = make_agent("vusfa", scenes=home, hidden_size=8, embedding_size=8, shared_heads=True)
+    >>> transplant(agent, other).config["scenes"]
+    ['kitchen', 'bedroom']
+    """
+    if not agent.config["shared_heads"]:
+        raise ConfigError(
+            "the agent has heads of its own for each scene; train one with agent.shared_heads=true to take"
+            " it to other scenes"
+        )
+    if scenes.num_actions != agent.config["num_actions"]:
+        raise ConfigError(
+            f"the agent chooses among {agent.config['num_actions']} actions, the scenes have"
+            f" {scenes.num_actions}"
+        )
+    fields = {field.name for field in dataclasses.fields(AgentConfig)}
+    copy = make_agent(scenes=scenes, **{k: v for k, v in agent.config.items() if k in fields})
+    try:
+        copy.load_state_dict(agent.state_dict())
+    except RuntimeError as error:
+        first = str(error).splitlines()[-1].strip()
+        raise ConfigError(f"the agent does not fit the scenes' features ({first})") from error
+    return copy.to(next(agent.parameters()).device).train(agent.training)
 
 
 class Agent(nn.Module):
@@ -97,12 +140,8 @@ class Agent(nn.Module):
     def __init__(self, config: AgentConfig, scenes: Any) -> None:
         super().__init__()
         self.config = _plain(config, scenes)
-        ideas, size, hidden, num_scenes = (
-            config.ideas,
-            config.embedding_size,
-            config.hidden_size,
-            scenes.num_scenes,
-        )
+        ideas, size, hidden = config.ideas, config.embedding_size, config.hidden_size
+        num_scenes = 1 if config.shared_heads else scenes.num_scenes
         self.encoder: nn.Module = _make_encoder(config, scenes)
         self.fusion = Fusion(size, hidden)
         self.scene_layer = SceneLayer(num_scenes, hidden, hidden)

@@ -76,6 +76,7 @@ _OURS_ALONE = (
     "successor_scale",
     "reward_scale",
     "initial_scale",
+    "shared_heads",
 )
 
 
@@ -100,6 +101,8 @@ class AgentConfig:
         embedding_layer: a linear layer behind the encoder's first; without it E must equal ``hidden_size``.
         state_layer: one more dense layer in the state's branch alone.
         memory: ``"lstm"``: a recurrent layer behind the fusion of state and goal.
+        shared_heads: the scene layer, psi, the value and the policy have one set of weights for all scenes
+            and do not read which scene it is; :func:`~vusfa.modules.transplant` takes it to others.
         successor_norm: how psi is normalised on its way into the policy: ``None``, ``"rms"``, ``"layer"``.
         successor_gain: factor on psi on that way.
         successor_scale: factor on the psi layer's output, about 1 / (1 - gamma).
@@ -124,6 +127,7 @@ class AgentConfig:
     embedding_layer: bool = True
     state_layer: bool = False
     memory: Literal["lstm"] | None = None
+    shared_heads: bool = False
     successor_norm: Literal["rms", "layer"] | None = None
     successor_gain: float = 1.0
     successor_scale: float = 1.0

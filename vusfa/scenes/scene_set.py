@@ -86,7 +86,9 @@ class SceneSet:
     def open(cls, scenes: str | os.PathLike[str] | Sequence[str | os.PathLike[str]]) -> SceneSet:
         """Bundled names and files alike: ``SceneSet.open(["bathroom", "my_room.h5"])``.
 
-        A bare word is a bundled name; whatever has a suffix or a folder in it is a file.
+        A bare word is a bundled name; whatever has a suffix or a folder in it is a file. Scenes that call
+        themselves alike, as rooms of one kind rendered from several seeds do, are called by their files'
+        names without suffix.
 
         Raises:
             SceneError: neither a bundled name nor a file, or a file with faults.
@@ -94,7 +96,13 @@ class SceneSet:
         >>> SceneSet.open("kitchen").num_states
         680
         """
-        return cls(_open_one(scene) for scene in _listed(scenes))
+        given = _listed(scenes)
+        opened = [_open_one(scene) for scene in given]
+        names = [scene.name for scene in opened]
+        for source, scene in zip(given, opened, strict=True):
+            if names.count(scene.name) > 1 and Path(source).suffix:
+                object.__setattr__(scene, "name", Path(source).stem)  # nobody else holds it yet
+        return cls(opened)
 
     @property
     def names(self) -> tuple[str, ...]:
