@@ -28,6 +28,10 @@ class Suite(StrEnum):
 
     env = "env"
     train = "train"
+    collect = "collect"
+    update = "update"
+    solve = "solve"
+    memory = "memory"
     eval = "eval"
     gpu = "gpu"
     scaling = "scaling"
@@ -37,18 +41,23 @@ class Suite(StrEnum):
 #: The modules of each suite, in order; each has ``run(options) -> Report``.
 MODULES: dict[str, tuple[str, ...]] = {
     "env": ("env_suite",),
-    "train": ("collect_suite", "update_suite", "solve_suite", "memory_suite"),
+    "collect": ("collect_suite",),
+    "update": ("update_suite",),
+    "solve": ("solve_suite",),
+    "memory": ("memory_suite",),
     "eval": ("eval_suite",),
     "gpu": ("gpu_suite",),
     "scaling": ("scaling_suite",),
 }
+#: Several modules under one name.
+GROUPS = {"train": ("collect", "update", "solve", "memory"), "all": tuple(MODULES)}
 #: More other load than this, in cores, and the timings are doubtful.
 BUSY = 0.2
 
 
 def measure(suite: str, options: Options) -> list[Report]:
     """Run the modules of a suite."""
-    names = [n for group in MODULES.values() for n in group] if suite == "all" else MODULES[suite]
+    names = [name for part in GROUPS.get(suite, (suite,)) for name in MODULES[part]]
     return [import_module(f"benchmarks.{name}").run(options) for name in names]
 
 

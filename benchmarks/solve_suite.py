@@ -25,17 +25,17 @@ from vusfa.scenes import SceneSet
 
 __all__ = ["PEERS", "Outcome", "checker", "is_solved", "run", "solve_row", "train_until"]
 
-#: Settings of SB3's algorithms: those of ours that they know (steps, advantages, Adam, entropy near our
-#: mean), and for PPO a few passes over each rollout.
+#: Settings of SB3's algorithms: those of ours that they know (steps, advantages, Adam, entropy as our mean),
+#: and for PPO a few passes over each rollout.
 PEERS: dict[str, dict[str, Any]] = {
     "A2C": {
-        "n_steps": 20,
+        "n_steps": 50,
         "learning_rate": 5e-4,
-        "ent_coef": 0.02,
+        "ent_coef": 0.005,
         "use_rms_prop": False,
         "normalize_advantage": True,
     },
-    "PPO": {"n_steps": 64, "batch_size": 1024, "n_epochs": 4, "learning_rate": 5e-4, "ent_coef": 0.01},
+    "PPO": {"n_steps": 64, "batch_size": 1024, "n_epochs": 4, "learning_rate": 5e-4, "ent_coef": 0.005},
 }
 SUCCESS, DETOUR = 0.95, 1.5
 MINUTES = 15
@@ -121,11 +121,19 @@ def run(options: Options) -> Report:
         trainer.close()
     peers: dict[str, Outcome] = {}
     for name, settings in PEERS.items():
-        num_envs, width = (8, 16) if options.quick else (64, 512)
-        model_ = make_sb3(name, session.scenes, session.goals, num_envs=num_envs, width=width, **settings)
+        num_envs, history = trainer.cfg.collector.num_envs, session.agent.config["history"]
+        model_ = make_sb3(
+            name,
+            session.scenes,
+            session.goals,
+            num_envs=num_envs,
+            width=session.agent.config["hidden_size"],
+            history=history,
+            **settings,
+        )
         peers[f"SB3 {name}"] = train_until(
             _learner(model_, num_envs * settings["n_steps"]),
-            checker(_policy(model_), session.scenes, session.goals, 4, options),
+            checker(_policy(model_), session.scenes, session.goals, history, options),
             cap,
             every,
         )

@@ -24,7 +24,7 @@ PROMISED = {
         "ParallelEnv, 2 workers",
         "AsyncVectorEnv, 2",
     ],
-    "collect_suite": ["collection, 1 threads", "collection, bare loop", "collection, features"],
+    "collect_suite": ["collection, 8 environments", "collection, bare loop", "collection, features"],
     "update_suite": [
         "updates, 1 frame",
         "updates, 4 frames, SB3 A2C, 5 steps",
