@@ -19,6 +19,7 @@ import tyro
 from vusfa.errors import VusfaError
 from vusfa.evaluation.files import check_folder
 from vusfa.report import Options, read_source, write_report
+from vusfa.report.page import even
 from vusfa.training import set_threads
 from vusfa.training.loggers import make_loggers
 
@@ -77,7 +78,7 @@ def report(
         ) as loggers:
             for name, rows in tables.items():
                 if rows:
-                    loggers.log_table(name, rows, 0)
+                    loggers.log_table(name, even(rows), 0)
     for path in paths:
         print(path)
 

@@ -84,7 +84,7 @@ def test_the_table_shows_what_the_csv_holds(tab: Any, page: Path):
         tab.select_option("#scene", scene)
         (row,) = (r for r in rows if (r["model"], r["goals"], r["scene"]) == ("vusfa", goals, scene))
         cells = tab.locator("#summary tbody tr:first-child td").all_inner_texts()
-        mean, low, high = (f"{100 * float(row[f'success_20{end}']):.1f}" for end in ("", "_low", "_high"))
+        mean, low, high = (f"{100 * float(row[f'success_20{end}']):.1f}" for end in ("", "_from", "_to"))
         assert cells[1] == row["seeds"] == "2"
         assert cells[2].split() == [mean, low, "–", high]
 

@@ -14,7 +14,7 @@ from typing import Any
 from vusfa.errors import ConfigError
 from vusfa.evaluation.files import replacing, write_csv
 
-__all__ = ["as_json", "make_page", "page_weight", "write_page", "write_tables"]
+__all__ = ["as_json", "even", "make_page", "page_weight", "write_page", "write_tables"]
 
 _SCRIPTS = ("core.js", "charts.js", "floors.js", "explorer.js", "main.js")
 
@@ -70,10 +70,18 @@ def write_tables(folder: str | Path, tables: Mapping[str, Sequence[Mapping[str, 
     written = []
     for name, rows in tables.items():
         if rows:
-            columns = list(dict.fromkeys(key for row in rows for key in row))
-            padded = [{key: row.get(key, math.nan) for key in columns} for row in rows]
-            written.append(write_csv(Path(folder) / f"{name}.csv", padded, columns))
+            written.append(write_csv(Path(folder) / f"{name}.csv", even(rows)))
     return written
+
+
+def even(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """The same rows, each with the columns of all; NaN where it has none.
+
+    >>> even([{"a": 1}, {"b": 2}])
+    [{'a': 1, 'b': nan}, {'a': nan, 'b': 2}]
+    """
+    columns = list(dict.fromkeys(key for row in rows for key in row))
+    return [{key: row.get(key, math.nan) for key in columns} for row in rows]
 
 
 def _asset(name: str) -> str:

@@ -162,8 +162,9 @@ def read_episodes(path: Path, max_steps: int) -> Episodes:
         raise ConfigError(f"{path}: {lacks}; evaluate the run again with recipes/zero_shot.py")
     names = tuple(dict.fromkeys(row["scene"] for row in rows))
     index = {name: place for place, name in enumerate(names)}
+    names_there = [*_COLUMNS, *(["remaining"] if "remaining" in rows[0] else [])]
     try:
-        columns = {name: torch.tensor([int(row[name]) for row in rows]) for name in _COLUMNS}
+        columns = {name: torch.tensor([int(row[name]) for row in rows]) for name in names_there}
     except (TypeError, ValueError) as error:
         raise ConfigError(f"{path}: {error}; evaluate the run again with recipes/zero_shot.py") from error
     for name in ("success", "trained"):

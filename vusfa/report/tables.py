@@ -9,6 +9,7 @@ from typing import Any
 import torch
 
 from vusfa.evaluation import Episodes, random_walk_summary, shortest_paths, summary
+from vusfa.report.intervals import intervals
 from vusfa.report.runs import Run
 from vusfa.scenes import SceneSet
 
@@ -84,17 +85,20 @@ def summary_rows(
 
     Returns:
         rows with model, kind ("model" or "reference"), goals, scene, seeds, num_goals and num_episodes (of
-        one seed), and mean, ``_low`` and ``_high`` over the seeds of every measure.
+        one seed), and of every measure the mean, ``_low`` and ``_high`` over the seeds, and the ends
+        ``_from`` and ``_to`` of its 95 % interval, see :mod:`vusfa.report.intervals`.
     """
     single = seed_rows(runs, within)
     names = measures(single)
     groups: dict[tuple[str, str, str], list[Row]] = {}
     for row in single:
         groups.setdefault((row["model"], row["goals"], row["scene"]), []).append(row)
+    tables = {run.label: [r.episodes for r in runs if r.label == run.label and r.episodes] for run in runs}
     rows = [
         {"model": label, "kind": "model", "goals": goals, "scene": scene, "seeds": len(group)}
         | {key: group[0][key] for key in ("num_goals", "num_episodes")}
         | over_seeds(group, names)
+        | intervals([_of(table, goals) for table in tables[label]], scene, names)
         for (label, goals, scene), group in groups.items()
     ]
     others: dict[tuple[str, str, str], Row] = {}
@@ -105,6 +109,12 @@ def summary_rows(
         counts = {key: row.get(key, math.nan) for key in ("num_goals", "num_episodes")}
         rows.append(head | counts | over_seeds([row], names))
     return rows
+
+
+def _of(episodes: Episodes, goals: str) -> Episodes:
+    if goals == "all":
+        return episodes
+    return episodes.select(episodes.trained if goals == "trained" else ~episodes.trained)
 
 
 def reference_rows(run: Run, scenes: SceneSet, within: Sequence[int] = (500, 100)) -> list[Row]:

@@ -33,12 +33,12 @@ function drawOverview() {
   const shown = models.map((row) => row.model);
   const traces = models.map((row) => {
     const colour = colourOf(row.model);
-    const [mean, low, high] = [row[name], row[`${name}_low`], row[`${name}_high`]].map((value) => scaled(name, value));
+    const [mean, low, high] = [row[name], row[`${name}_from`], row[`${name}_to`]].map((value) => scaled(name, value));
     return {
       type: "scatter", mode: "markers", x: [mean], y: [row.model], showlegend: false,
       marker: { color: colour, size: 15, symbol: SYMBOLS[place(row.model) % 8], line: { color: css("--panel"), width: 1.5 } },
-      error_x: { type: "data", symmetric: false, array: [high - mean], arrayminus: [mean - low], color: colour, thickness: 2.5, width: 0 },
-      hovertemplate: `<b>${row.model}</b><br>mean of ${row.seeds} seed${row.seeds > 1 ? "s" : ""}: %{x:.1f}<br>from ${low?.toFixed(1)} to ${high?.toFixed(1)}<extra></extra>`,
+      error_x: { type: "data", symmetric: false, array: [Math.max(0, high - mean)], arrayminus: [known(low) ? Math.max(0, mean - low) : 0], color: colour, thickness: 2.5, width: 0 },
+      hovertemplate: `<b>${row.model}</b><br>mean of ${row.seeds} seed${row.seeds > 1 ? "s" : ""}: %{x:.1f}<br>95 % interval ${low?.toFixed(1)} to ${high?.toFixed(1)}<extra></extra>`,
     };
   });
   const seeds = rowsOf("seeds").filter((row) => known(row[name]));
@@ -83,7 +83,7 @@ function drawSummary() {
     label.append(row.model);
     const cells = DATA.measures.map((name) => {
       const cell = make("td", row[name] === best[name] && row.kind === "model" ? { class: "best" } : {}, number(name, row[name]));
-      if (row.seeds > 1) cell.append(make("small", {}, `${number(name, row[`${name}_low`])} – ${number(name, row[`${name}_high`])}`));
+      if (known(row[`${name}_from`])) cell.append(make("small", {}, `${number(name, row[`${name}_from`])} – ${number(name, row[`${name}_to`])}`));
       return cell;
     });
     return make("tr", { class: row.kind }, label, make("td", {}, known(row.seeds) ? String(row.seeds) : ""), ...cells);
