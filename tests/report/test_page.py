@@ -95,9 +95,8 @@ def test_goals_are_fewer_where_the_page_would_be_too_heavy():
 
 def test_who_asks_for_too_many_goals_is_told(runs: list[Run]):
     lines: list[str] = []
-    content, _ = gather(
-        runs[:1], Options(goals_per_scene=99, megabytes=1, walks=1, max_steps=3, tell=lines.append)
-    )
+    options = Options(goals_per_scene=99, megabytes=1, walks=1, max_steps=3, tell=lines.append)
+    content, _ = gather(runs[:1], options)
     assert content["goals_limit"] == 43 < content["goals_asked"] == 99
     assert [len(goals) for goals in content["goals"].values()] == [43, 43]
     assert "the explorer has 43 goals a scene, for the page's weight" in lines
