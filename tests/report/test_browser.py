@@ -125,6 +125,7 @@ def test_the_map_shows_success_by_goal(tab: Any, runs: list[Run]):
     best, worst = "rgb(253, 231, 37)", "rgb(68, 1, 84)"
     assert [colour == best for colour in shown] == [reached[goal] for goal in range(176)]
     assert set(shown) <= {best, worst}
+    assert tab.locator("#map-unknown").is_hidden()  # every state was a goal
     tab.select_option("#map-measure", "spl")
     assert len(set(colours(tab, "#map-grid .map-row:nth-child(2)")[:176])) > 2
 

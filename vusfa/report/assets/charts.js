@@ -167,14 +167,16 @@ function drawCurves() {
 }
 
 function drawRuns() {
+  const rows = DATA.tables.runs;
+  const told = (key) => rows.some((row) => row[key] !== "" && row[key] !== null) && (key !== "scenes" || new Set(rows.map((row) => row.scenes)).size > 1);
   const columns = [
     ["model", "model", String], ["seed", "seed", String], ["folder", "folder", String], ["frames", "frames", (v) => (known(v) ? grouped(v) : "–")],
     ["minutes", "minutes", (v) => (known(v) ? v.toFixed(1) : "–")], ["device", "device", String], ["history", "frames seen", (v) => (known(v) ? String(v) : "–")],
     ["trained_success", "trained goals (%)", (v) => number("spl", v)], ["unseen_success", "unseen goals (%)", (v) => number("spl", v)], ["evaluated", "evaluated", String], ["scenes", "scenes", words],
-  ];
+  ].filter(([key]) => told(key));
   const left = (key) => (key === "scenes" ? { class: "left wrap" } : ["folder", "device", "evaluated"].includes(key) ? { class: "left" } : {});
   const head = make("tr", {}, ...columns.map(([key, title]) => make("th", left(key), title)));
-  const body = DATA.tables.runs.map((row) => make("tr", {}, ...columns.map(([key, , format]) => make("td", left(key), format(row[key])))));
+  const body = rows.map((row) => make("tr", {}, ...columns.map(([key, , format]) => make("td", left(key), format(row[key])))));
   $("run-table").replaceChildren(make("thead", {}, head), make("tbody", {}, ...body));
 }
 
