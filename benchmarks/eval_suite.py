@@ -7,6 +7,7 @@ import time
 import torch
 
 from benchmarks.report import Options, Report, Requirement, Row
+from benchmarks.trainer import recipe_settings
 from vusfa.envs import resolve_goals
 from vusfa.evaluation import evaluate
 from vusfa.modules import ActingPolicy, make_agent
@@ -18,12 +19,23 @@ MINUTES = 2.0
 
 
 def run(options: Options) -> Report:
-    """An untrained VUSFA agent, which wanders for most of the 500 steps: a trained one takes less time."""
+    """Untrained VUSFA agents, which wander for most of the 500 steps: trained ones take less time.
+
+    One as the recipe builds it, and one of four frames with layers of 512, as preset=controlled has it.
+    """
     scenes = SceneSet.bundled(["bathroom"] if options.quick else None)
-    size = 16 if options.quick else 512
-    torch.manual_seed(0)
     torch.set_num_threads(options.threads)
-    agent = make_agent("vusfa", scenes=scenes, hidden_size=size, embedding_size=size)
+    recipe = recipe_settings(options.overrides).agent
+    sizes = {f"{recipe.history} frames of {recipe.hidden_size}": (recipe.history, recipe.hidden_size)}
+    report = Report("eval")
+    for name, (history, size) in {**sizes, "4 frames of 512": (4, 512)}.items():
+        _measure(name, scenes, history, 16 if options.quick else size, options, report)
+    return report
+
+
+def _measure(name: str, scenes: SceneSet, history: int, size: int, options: Options, report: Report) -> None:
+    torch.manual_seed(0)
+    agent = make_agent("vusfa", scenes=scenes, history=history, hidden_size=size, embedding_size=size)
     actor = ActingPolicy(agent)
     goals = resolve_goals(scenes, "all")
     each, limit = (1, 10) if options.quick else (10, 500)
@@ -31,7 +43,15 @@ def run(options: Options) -> Report:
 
     def seconds(some: torch.Tensor, batch: int, episodes: int) -> float:
         began = time.perf_counter()
-        evaluate(actor, scenes, some, episodes_per_goal=episodes, max_steps=limit, batch_size=batch)
+        evaluate(
+            actor,
+            scenes,
+            some,
+            episodes_per_goal=episodes,
+            max_steps=limit,
+            batch_size=batch,
+            history=history,
+        )
         return time.perf_counter() - began
 
     seconds(goals[:2], 16, 1)  # unmeasured
@@ -40,11 +60,9 @@ def run(options: Options) -> Report:
     whole = seconds(chosen, 4096, each)
     again = seconds(sample, 1, 1) / len(sample) * len(chosen) * each
     alone = (alone + again) / 2
-    label = f"zero-shot evaluation, {len(chosen):,} goals, {each} episodes each"
+    label = f"zero-shot evaluation, {name}, {len(chosen):,} goals, {each} episodes each"
     note = f"of {len(sample)} episodes before and {len(sample)} after, scaled to all"
-    report = Report("eval")
     untrained = "an untrained agent, which needs most of the steps; a trained one is quicker"
     report.rows.append(Row(label, whole, "s", "one episode at a time", alone / whole, untrained))
     report.rows.append(Row(f"{label}, one episode at a time", alone, "s", note=note))
     report.requirements.append(Requirement(label, whole / 60, MINUTES, "minutes", at_least=False))
-    return report

@@ -23,22 +23,17 @@ RECIPES = Path(__file__).parents[2] / "recipes"
 
 
 @pytest.fixture(scope="session")
-def run_folders(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
-    """Two seeds of vusfa, one of gvf, in two bundled rooms; every state was a goal once."""
+def train_run() -> Callable[[Path, list[str]], Path]:
+    """Trains a small agent for 2000 frames into a folder, and makes every state a goal once."""
     sys.path.insert(0, str(RECIPES))
     train = import_module("train").train
     sys.path.remove(str(RECIPES))
     sys.modules.pop("train")
-    folders = []
-    for model, seed in (("vusfa", 0), ("vusfa", 1), ("gvf", 0)):
-        folder = tmp_path_factory.mktemp("runs") / f"{model}-{seed}"
+
+    def made(folder: Path, options: list[str]) -> Path:
         overrides = [
-            f"agent.model={model}",
-            f"seed={seed}",
             f"folder={folder}",
-            "scenes=[bathroom,bedroom]",
             "env.max_steps=20",
-            "agent.history=1",
             "agent.hidden_size=8",
             "agent.embedding_size=8",
             "collector.num_envs=10",
@@ -48,12 +43,27 @@ def run_folders(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
             "evaluation=all",
             "evaluation.episodes_per_goal=1",
             "evaluation.max_steps=20",
+            *options,
         ]
         cfg = compose(RECIPES / "conf", "train", overrides)
         OmegaConf.resolve(cfg)
         train(cfg, overrides)
-        folders.append(folder)
-    return folders
+        return folder
+
+    return made
+
+
+@pytest.fixture(scope="session")
+def run_folders(
+    train_run: Callable[[Path, list[str]], Path], tmp_path_factory: pytest.TempPathFactory
+) -> list[Path]:
+    """Two seeds of vusfa, one of gvf, in two bundled rooms."""
+    root, scenes = tmp_path_factory.mktemp("runs"), ["scenes=[bathroom,bedroom]", "agent.history=1"]
+    wanted = [("vusfa", 0), ("vusfa", 1), ("gvf", 0)]
+    return [
+        train_run(root / f"{model}-{seed}", [*scenes, f"agent.model={model}", f"seed={seed}"])
+        for model, seed in wanted
+    ]
 
 
 @pytest.fixture(scope="session")

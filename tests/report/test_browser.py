@@ -7,12 +7,13 @@ import itertools
 import json
 import re
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from vusfa.report import Options, read_run, write_report
 from vusfa.report.runs import Run
 from vusfa.scenes import Scene
 
@@ -67,6 +68,7 @@ def test_it_draws_all_its_parts(tab: Any, runs: list[Run]):
     assert tab.inner_text("h1") == "A <b>title</b> & </script>"
     for chart in ("overview", "distance-plot", "curves"):
         assert tab.locator(f"#{chart} .main-svg").count() >= 1, chart
+        assert tab.evaluate(f"[$('{chart}').clientHeight >= $('{chart}').layout.height]") == [True], chart
         assert tab.locator(f"#{chart} path.point, #{chart} path.js-line").count() >= 2, chart
     assert tab.locator("#run-table tbody tr").count() == len(runs)
     names = tab.locator("#summary tbody tr td:first-child").all_inner_texts()
@@ -123,6 +125,7 @@ def test_the_map_shows_success_by_goal(tab: Any, runs: list[Run]):
     best, worst = "rgb(253, 231, 37)", "rgb(68, 1, 84)"
     assert [colour == best for colour in shown] == [reached[goal] for goal in range(176)]
     assert set(shown) <= {best, worst}
+    assert tab.locator("#map-unknown").is_hidden()  # every state was a goal
     tab.select_option("#map-measure", "spl")
     assert len(set(colours(tab, "#map-grid .map-row:nth-child(2)")[:176])) > 2
 
@@ -231,3 +234,27 @@ def test_nothing_is_fetched_from_outside(opened: tuple[Any, list[str], list[str]
     assert refused == "refused"
     assert any("Content Security Policy" in complaint for complaint in complaints)
     complaints.clear()
+
+
+@pytest.mark.parametrize("options", [["agent.history=2"], ["agent.memory=lstm"]])
+def test_an_agent_with_a_past(
+    chromium: Any, train_run: Callable[..., Path], scene_file: Path, tmp_path: Path, options: list[str]
+):
+    """Its next action does not follow from a pose alone: no walks are drawn in the page."""
+    folder = train_run(tmp_path / "run", [f"scenes=[{scene_file}]", "env.goals=[3,9]", *options])
+    write_report([read_run(folder)], tmp_path / "page.html", Options(goals_per_scene=4, max_steps=9))
+    complaints: list[str] = []
+    tab = chromium.new_page()
+    tab.on("console", lambda message: complaints.append(message.text))
+    tab.on("pageerror", lambda error: complaints.append(str(error)))
+    tab.goto((tmp_path / "page.html").as_uri())
+    tab.wait_for_selector("html[data-ready=yes]")
+    assert len(colours(tab, "#x-map")) == 16
+    assert tab.locator("#x-again").is_disabled()
+    assert "at most 4 goals a scene." in tab.inner_text("#about")
+    way = tab.evaluate("at.way")
+    tab.locator("#x-map path.s").first.dispatch_event("click")
+    assert tab.evaluate("at.way") == way
+    assert tab.locator("#map-grid .map-row").count() == 2
+    assert complaints == []
+    tab.close()

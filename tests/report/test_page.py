@@ -78,6 +78,7 @@ def test_pictures_give_way_to_the_weight(runs: list[Run], tmp_path: Path):
     assert page.stat().st_size <= 5.5e6
     held = [len(scene["pictures"]["ids"]) for scene in data_of(page)["scenes"].values()]
     assert 0 < sum(held) < 580
+    assert data_of(page)["goals_limit"] == 4
 
 
 def test_too_heavy_without_a_picture(runs: list[Run], tmp_path: Path):
@@ -90,6 +91,15 @@ def test_goals_are_fewer_where_the_page_would_be_too_heavy():
     assert goal_limit([1000], 1, Options(goals_per_scene=10**6, megabytes=4)) == 100
     assert goal_limit([1000], 10, Options(goals_per_scene=10**6, megabytes=4)) == 10
     assert goal_limit([10**9], 1, Options()) == 1
+
+
+def test_who_asks_for_too_many_goals_is_told(runs: list[Run]):
+    lines: list[str] = []
+    options = Options(goals_per_scene=99, megabytes=1, walks=1, max_steps=3, tell=lines.append)
+    content, _ = gather(runs[:1], options)
+    assert content["goals_limit"] == 43 < content["goals_asked"] == 99
+    assert [len(goals) for goals in content["goals"].values()] == [43, 43]
+    assert "the explorer has 43 goals a scene, for the page's weight" in lines
 
 
 def test_every_seed_on_demand(runs: list[Run]):

@@ -133,6 +133,21 @@ def test_all_cells_of_an_experiment(results: Path):
     assert first.exact.success_100[0] == 0.25
 
 
+def test_cells_in_the_papers_order_and_by_seed(results: Path):
+    for name, model, seed in (("a", "sfdp", 10), ("b", "sfdp", 9), ("c", "gvf", 0), ("d", "random walk", 0)):
+        info = {"model": model, "seed": seed, "scenes": ["bathroom"]}
+        write_cell(results.parent, Cell("table1", name, info, {}))
+    found = [(run.label, run.seed) for run in read_source(results)]
+    assert found == [
+        ("gvf", 0),
+        ("sfdp", 9),
+        ("sfdp", 10),
+        ("vusfa (paper)", 0),
+        ("vusfa (paper)", 1),
+        ("random walk", 0),
+    ]
+
+
 def test_one_cell_and_its_greedy_episodes(results: Path):
     (run,) = read_source(f"x={results / 'vusfa-1'}", "greedy")
     assert (run.label, run.variant, run.exact) == ("x", "greedy", None)

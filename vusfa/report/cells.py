@@ -9,6 +9,7 @@ from typing import Any
 
 from vusfa.errors import ConfigError
 from vusfa.evaluation.results import read_cell
+from vusfa.modules.presets import MODELS
 from vusfa.report.runs import Run, read_curves, read_run, split_name
 
 __all__ = ["cell_run", "read_source"]
@@ -45,7 +46,7 @@ def read_source(source: str | Path, way: str = "sampled", runs: str | Path = "ru
             f"{folder} holds neither a run (config.json) nor results (cell.json); give the folder of a run of"
             " recipes/train.py, or of a cell or an experiment of results"
         )
-    return [cell_run(cell, label, way, runs) for cell in cells]
+    return sorted((cell_run(cell, label, way, runs) for cell in cells), key=_order)
 
 
 def cell_run(folder: Path, label: str = "", way: str = "sampled", runs: str | Path = "runs") -> Run:
@@ -87,6 +88,12 @@ def cell_run(folder: Path, label: str = "", way: str = "sampled", runs: str | Pa
         cell.exact if way == "sampled" else None,
         {"frames": _number(info, "frames"), "seconds": _number(info, "training_s")},
     )
+
+
+def _order(run: Run) -> tuple[int, str, int]:
+    """The paper's order of models, then seeds."""
+    model = run.settings["agent"]["model"]
+    return list(MODELS).index(model) if model in MODELS else len(MODELS), run.label, run.seed
 
 
 def _label(info: Mapping[str, Any], name: str) -> str:

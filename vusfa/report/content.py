@@ -139,6 +139,8 @@ def gather(
         for run in [run for run in runs if run.label == label and run.checkpoint][: options.seeds]
     ]
     limit = goal_limit([scene.num_states for scene in scenes.values()], len(shown), options)
+    if limit < options.goals_per_scene:
+        options.tell(f"the explorer has {limit} goals a scene, for the page's weight")
     goals = {name: _explored_goals(scene, rows["goals"], limit) for name, scene in scenes.items()}
     options.tell("floor maps")
     content: dict[str, Any] = {
@@ -158,6 +160,7 @@ def gather(
         "maps": _success_maps(rows["goals"], scenes, options.within),
         "goals": goals,
         "goals_asked": options.goals_per_scene,
+        "goals_limit": limit,
         "agents": [],
     }
     for run in shown:

@@ -188,6 +188,16 @@ class Session:
             },
         )
 
+    def adopt(self, state: Mapping[str, Any], path: str | Path = "the checkpoint") -> None:
+        """Take over a checkpoint's weights and the bottleneck's multiplier, and nothing else.
+
+        Raises:
+            CheckpointError: the weights are of another model.
+        """
+        _load_weights(self.agent, state, path)
+        adapted = {key: state["loss"][key] for key in _ADAPTED if key in state["loss"]}
+        self.loss.load_state_dict(adapted, strict=False)
+
     def resume(self, path: str | Path) -> list[str]:
         """Go on from a checkpoint; to be called before :meth:`collecting`.
 
@@ -206,10 +216,8 @@ class Session:
             if key not in _OF_SCENES:
                 check_setting(path, f"agent.{key}", state["agent_config"].get(key), value)
         check_setting(path, "env.goals", state["goals"].tolist(), self.goals.tolist())
-        _load_weights(self.agent, state, path)
+        self.adopt(state, path)
         _load_optimiser(self.optimiser, state, path)
-        adapted = {key: state["loss"][key] for key in _ADAPTED if key in state["loss"]}
-        self.loss.load_state_dict(adapted, strict=False)
         self.episodes.load_state_dict(state["meter"]["episodes"])
         self.terms.load_state_dict(state["meter"]["terms"])
         if self.replay is not None:

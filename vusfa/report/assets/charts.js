@@ -19,6 +19,16 @@ function layout(more) {
   return merged;
 }
 
+// Plotly fills its host, which must be as high as the chart is to be; on a narrow screen the legend stands above it, a line a model.
+function plot(id, traces, wanted) {
+  const named = traces.filter((trace) => trace.name && trace.showlegend !== false).length;
+  const height = wanted.height + (narrow() ? 21 * named : 0);
+  $(id).style.height = `${height + (narrow() ? 6 : 14)}px`;
+  Plotly.react(id, traces, layout({ ...wanted, height }), CONFIG);
+}
+
+const narrow = () => innerWidth < 600;
+
 const scaled = (name, value) => (known(value) ? (isShare(name) ? 100 * value : value) : null);
 
 function rowsOf(table) {
@@ -54,15 +64,15 @@ function drawOverview() {
   }));
   const values = [...traces.flatMap((trace) => trace.x), ...beside.map((row) => scaled(name, row[name]))].filter(known);
   const most = Math.max(...values, 0);
-  const notes = beside.map((row) => ({
-    text: row.model, x: scaled(name, row[name]), xref: "x", y: 1, yref: "paper", yanchor: "bottom", showarrow: false, font: { color: css("--muted"), size: 12 },
+  const notes = beside.map((row, i) => ({
+    text: row.model, yshift: narrow() ? 14 * i : 0, x: scaled(name, row[name]), xref: "x", y: 1, yref: "paper", yanchor: "bottom", showarrow: false, font: { color: css("--muted"), size: 12 },
     xanchor: scaled(name, row[name]) > 0.85 * most ? "right" : scaled(name, row[name]) < 0.1 * most ? "left" : "center",
   }));
-  Plotly.react("overview", traces, layout({
-    height: 120 + 46 * Math.max(2, shown.length), shapes: lines, annotations: notes, margin: { l: 20, r: 24, t: 30, b: 50 },
-    xaxis: { title: titleOf(name), range: isShare(name) ? [0, 102] : [0, 1.06 * most], ticksuffix: isShare(name) ? " %" : "" },
+  plot("overview", traces, {
+    height: 120 + 46 * Math.max(2, shown.length), shapes: lines, annotations: notes, margin: { l: 20, r: 24, t: narrow() ? 44 : 30, b: 50 },
+    xaxis: { title: narrow() ? headOf(name) : titleOf(name), range: isShare(name) ? [0, 102] : [0, 1.06 * most], ticksuffix: isShare(name) ? " %" : "" },
     yaxis: { type: "category", categoryorder: "array", categoryarray: [...shown].reverse(), range: [-0.6, shown.length - 0.4], tickfont: { color: css("--ink"), size: 13 }, showgrid: false },
-  }), CONFIG);
+  });
 }
 
 function drawSummary() {
@@ -108,10 +118,10 @@ function drawDistance() {
       text: rows.map((row) => `${grouped(row.num_goals)} goals, ${row.seeds} seed${row.seeds > 1 ? "s" : ""}`), hovertemplate: `<b>${model.label}</b><br>%{y:.1f} %, %{text}<extra></extra>`,
     };
   }).filter((trace) => trace.x.length);
-  Plotly.react("distance-plot", traces, layout({
+  plot("distance-plot", traces, {
     height: 380, showlegend: true, xaxis: { title: "actions from the nearest trained goal", type: "category", categoryorder: "array", categoryarray: order },
-    yaxis: { title: titleOf(name).replace(/:.*\(/, " ("), rangemode: "tozero", ticksuffix: " %", autorangeoptions: { clipmax: 103 } },
-  }), CONFIG);
+    yaxis: { title: narrow() ? headOf(name) : titleOf(name).replace(/:.*\(/, " ("), rangemode: "tozero", ticksuffix: " %", autorangeoptions: { clipmax: 103 } },
+  });
 }
 
 const CURVES = {
@@ -149,22 +159,24 @@ function drawCurves() {
       line: { color: colour, width: 2.5, dash: DASHES[place(curve.model) % 8] }, hovertemplate: "%{y:.4g}",
     });
   }
-  Plotly.react("curves", traces, layout({
+  plot("curves", traces, {
     height: 400, hovermode: "x unified", showlegend: true,
     xaxis: { title: axis === "x" ? "frames (actions of all environments)" : "minutes of training", rangemode: "tozero", hoverformat: axis === "x" ? ",.0f" : ".1f" },
     yaxis: { title: CURVES[measure] || measure, rangemode: "tozero", type: measure === "length_ratio" ? "log" : "linear", ticksuffix: factor === 100 ? " %" : "" },
-  }), CONFIG);
+  });
 }
 
 function drawRuns() {
+  const rows = DATA.tables.runs;
+  const told = (key) => rows.some((row) => row[key] !== "" && row[key] !== null) && (key !== "scenes" || new Set(rows.map((row) => row.scenes)).size > 1);
   const columns = [
     ["model", "model", String], ["seed", "seed", String], ["folder", "folder", String], ["frames", "frames", (v) => (known(v) ? grouped(v) : "–")],
     ["minutes", "minutes", (v) => (known(v) ? v.toFixed(1) : "–")], ["device", "device", String], ["history", "frames seen", (v) => (known(v) ? String(v) : "–")],
     ["trained_success", "trained goals (%)", (v) => number("spl", v)], ["unseen_success", "unseen goals (%)", (v) => number("spl", v)], ["evaluated", "evaluated", String], ["scenes", "scenes", words],
-  ];
-  const left = (key) => (["folder", "scenes", "device", "evaluated"].includes(key) ? { class: "left" } : {});
+  ].filter(([key]) => told(key));
+  const left = (key) => (key === "scenes" ? { class: "left wrap" } : ["folder", "device", "evaluated"].includes(key) ? { class: "left" } : {});
   const head = make("tr", {}, ...columns.map(([key, title]) => make("th", left(key), title)));
-  const body = DATA.tables.runs.map((row) => make("tr", {}, ...columns.map(([key, , format]) => make("td", left(key), format(row[key])))));
+  const body = rows.map((row) => make("tr", {}, ...columns.map(([key, , format]) => make("td", left(key), format(row[key])))));
   $("run-table").replaceChildren(make("thead", {}, head), make("tbody", {}, ...body));
 }
 

@@ -102,7 +102,7 @@ function number(name, value) {
 function percent(value) {
   if (!known(value)) return "not known";
   const near = (value > 0.99 && value < 1) || (value > 0 && value < 0.01);
-  return `${near ? (Math.floor(1000 * value) / 10).toFixed(1) : (100 * value).toFixed(0)} %`;
+  return `${near ? (Math.floor(1000 * value) / 10).toFixed(1) : (100 * value).toFixed(0)}\u00a0%`;
 }
 const grouped = (value) => Math.round(value).toLocaleString("en-GB").replaceAll(",", " ");
 

@@ -80,6 +80,7 @@ const successMaps = [];
 function paintSuccess() {
   const name = $("map-measure").value;
   drawScale($("map-scale"), VIRIDIS, "0", "100", "%");
+  $("map-unknown").hidden = !successMaps.some(({ row }) => row[name] && unpack(row[name]).some(Number.isNaN));
   for (const { map, row, caption } of successMaps) {
     const values = row[name] ? unpack(row[name]) : [];
     map.paint((state) => ramp(VIRIDIS, values[state]));

@@ -1,0 +1,99 @@
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+import torch
+
+from vusfa.envs import resolve_goals
+from vusfa.errors import GoalError
+from vusfa.evaluation.results import Cell
+from vusfa.evaluation.transfer import KINDS, area_under, frames_to, new_goals
+from vusfa.evaluation.transfer_figure import draw_transfer, mean_over, transfer_table
+from vusfa.scenes import Scene, SceneSet
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_new_goals_are_as_far_as_their_kind_says(kind: str) -> None:
+    rooms = SceneSet.bundled()
+    trained = resolve_goals(rooms, "paper")
+    sets = [new_goals(rooms, trained, kind, index) for index in range(5)]
+    for goals in sets:
+        assert rooms.scene_id[goals].bincount().tolist() == [5, 5, 5, 5]
+        for goal in goals:
+            here = trained[rooms.scene_id[trained] == rooms.scene_id[goal]]
+            nearest = min(int(rooms.distance(goal, other)) for other in here)
+            assert nearest == KINDS[kind] if KINDS[kind] else nearest > 0
+    assert len({tuple(goals.tolist()) for goals in sets}) == 5
+    assert torch.equal(new_goals(rooms, trained, kind, 3), sets[3])
+    assert not torch.equal(new_goals(rooms, trained, kind, 3, seed=1), sets[3])
+
+
+def test_scenes_without_trained_goals_get_none(make_scene: Callable[..., Scene]) -> None:
+    rooms = SceneSet([make_scene("hall"), make_scene("attic", 3, 1)])
+    goals = new_goals(rooms, torch.tensor([17]), "random", 0, per_scene=4)
+    assert len(goals) == 4
+    assert bool((goals >= 16).all())
+    assert 17 not in goals
+
+
+def test_what_cannot_be_drawn(make_scene: Callable[..., Scene]) -> None:
+    rooms = SceneSet([make_scene("hall")])
+    with pytest.raises(GoalError, match="'3-steps'; give one of 1-step"):
+        new_goals(rooms, torch.tensor([0]), "3-steps", 0)
+    with pytest.raises(GoalError, match="scene 'hall' has 15 states of the kind 'random'; 16 are wanted"):
+        new_goals(rooms, torch.tensor([0]), "random", 0, per_scene=16)
+
+
+def test_area_by_hand() -> None:
+    assert area_under([0, 100, 400], [500, 100, 20]) == pytest.approx((100 * 300 + 300 * 60) / 400)
+    with pytest.raises(ValueError, match="two points"):
+        area_under([0], [3.0])
+
+
+def test_frames_to_by_hand() -> None:
+    frames, values = [0, 100, 200, 300], [500.0, 100.0, 40.0, 60.0]
+    assert frames_to(frames, values, 50) == pytest.approx(100 + 100 * 50 / 60)
+    assert frames_to(frames, values, 500) == 0
+    assert math.isnan(frames_to(frames, values, 39))
+
+
+def test_mean_over_leaves_out_what_never_came_there() -> None:
+    estimate = mean_over([[1.0, math.nan], [3.0, 5.0]])
+    assert estimate.value == pytest.approx(3.0)
+    assert 1.0 <= estimate.low <= 3.0 <= estimate.high <= 5.0
+
+
+def cell(model: str, seed: int, lengths: list[list[float]]) -> Cell:
+    curves = [
+        {
+            "trained on": {"frames": [0, 100, 200], "length": row},
+            "from scratch": {"frames": [0, 100, 200], "length": [500.0, 500.0, 500.0]},
+        }
+        for row in lengths
+    ]
+    return Cell("transfer", f"{model}-{seed}", {"model": model, "kind": "1-step", "curves": curves}, {})
+
+
+def test_the_table_by_hand() -> None:
+    cells = [cell("gvf", 0, [[100, 50, 10], [100, 60, 20]]), cell("gvf", 1, [[100, 70, 30], [100, 80, 40]])]
+    lines = transfer_table(cells, threshold=55).splitlines()
+    assert len(lines) == 4
+    row = [part.strip() for part in lines[2].split("|")[1:-1]]
+    assert row[:4] == ["1-step", "gvf", "trained on", "2"]
+    assert row[4].split(" ")[0] == f"{(52.5 + 60 + 67.5 + 75) / 4:.1f}"
+    assert row[5] == "100.0 [100.0, 100.0]"
+    assert row[6].split(" ")[0] == "25.0"
+    assert row[7].split(" ")[0] == f"{(90 + 112.5 + 137.5 + 162.5) / 4:,.0f}"
+    assert row[8] == "4 of 4"
+    assert lines[3].split("|")[8:10] == [" - ", " 0 of 4 "]
+
+
+def test_the_picture(tmp_path: Path) -> None:
+    path = draw_transfer(
+        [cell("gvf", 0, [[100, 50, 10]]), cell("vusfa", 0, [[90, 40, 9]])], tmp_path / "a.png"
+    )
+    assert path.read_bytes()[:8] == b"\x89PNG\r\n\x1a\n"
+    assert [entry.name for entry in tmp_path.iterdir()] == ["a.png"]

@@ -1,0 +1,96 @@
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from omegaconf import OmegaConf
+
+from vusfa.scenes import SceneSet
+from vusfa.training import load_agent
+from vusfa.training.launch import compose
+from vusfa.training.setup import make_training
+from vusfa.training.transfer import fine_tune, fine_tuning_settings
+
+CONF = Path(__file__).parents[2] / "recipes" / "conf"
+
+
+@pytest.fixture
+def config(scene_file: Path) -> dict[str, Any]:
+    cfg = compose(
+        CONF,
+        "train",
+        [
+            f"scenes=[{scene_file}]",
+            "env.goals=[3,9,12]",
+            "env.max_steps=20",
+            "agent.hidden_size=8",
+            "agent.embedding_size=8",
+            "collector.num_envs=6",
+            "collector.rollout=4",
+            "total_frames=480",
+        ],
+    )
+    OmegaConf.resolve(cfg)
+    return OmegaConf.to_container(cfg)  # type: ignore[return-value]
+
+
+@pytest.fixture
+def checkpoint(config: dict[str, Any], tmp_path: Path) -> Path:
+    training = make_training(config)
+    with training.session.collecting(training.make_collector) as batches:
+        training.update(batches)
+        with torch.no_grad():
+            training.session.loss.bottleneck_coeff.fill_(0.25)
+        return training.session.save(tmp_path / "checkpoint.pt")
+
+
+def test_schedules_end_with_the_new_training(config: dict[str, Any]) -> None:
+    config["optim"]["horizon"] = 7
+    settings = fine_tuning_settings(config, torch.tensor([5, 6]), frames=96, seed=4)
+    assert settings["entropy"]["horizon"] == 96
+    assert settings["optim"]["horizon"] == 7  # was no part of the run's own
+    assert (settings["total_frames"], settings["seed"], settings["env"]["goals"]) == (96, 4, [5, 6])
+    assert config["env"]["goals"] == [3, 9, 12]
+
+
+def test_a_curve(config: dict[str, Any], checkpoint: Path) -> None:
+    _, scenes, state = load_agent(checkpoint)
+    settings = fine_tuning_settings(state["config"], torch.tensor([5, 6]), frames=96, seed=4)
+    curve = fine_tune(state, settings, scenes, every=48)
+    assert curve["frames"] == [0, 48, 96]
+    assert all(1 <= length <= 20 for length in curve["length"])
+    assert all(0 <= success <= 1 for success in curve["success"])
+    assert fine_tune(state, settings, scenes, every=48) == curve
+
+
+def test_trained_on_begins_where_the_agent_was_and_scratch_does_not(
+    checkpoint: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    _, scenes, state = load_agent(checkpoint)
+    seen: list[dict[str, Any]] = []
+    settings = fine_tuning_settings(state["config"], torch.tensor([5]), frames=24, seed=9)
+
+    def made(settings: dict[str, Any], scenes: SceneSet) -> Any:
+        training = make_training(settings, scenes=scenes)
+        collecting: Callable[..., Any] = training.session.collecting
+
+        def kept(make: Any) -> Any:
+            beta = training.session.loss.bottleneck_coeff.item()
+            seen.append(
+                {"beta": beta, **{k: v.clone() for k, v in training.session.agent.state_dict().items()}}
+            )
+            return collecting(make)
+
+        monkeypatch.setattr(training.session, "collecting", kept)
+        return training
+
+    monkeypatch.setattr("vusfa.training.transfer.make_training", made)
+    for start in (state, None):
+        fine_tune(start, settings, scenes, every=1000)
+    weight = next(name for name in state["agent"] if name.endswith("weight"))
+    assert torch.equal(seen[0][weight], state["agent"][weight])
+    assert not torch.equal(seen[1][weight], state["agent"][weight])
+    assert (seen[0]["beta"], seen[1]["beta"]) == (0.25, pytest.approx(0.0, abs=0.01))

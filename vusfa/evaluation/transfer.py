@@ -1,0 +1,98 @@
+"""The paper's Figure 2: new goals near the trained ones, or anywhere, and how fast they are learned.
+
+Pure functions: which goals, and what numbers a curve of episode lengths comes to.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from vusfa.errors import GoalError
+from vusfa.scenes import SceneSet
+
+__all__ = ["KINDS", "area_under", "frames_to", "new_goals"]
+
+#: Fewest actions from a new goal to the nearest trained one; None: any state that is not trained.
+KINDS: dict[str, int | None] = {"1-step": 1, "2-steps": 2, "4-steps": 4, "random": None}
+
+
+def new_goals(
+    scenes: SceneSet, trained: Tensor, kind: str, index: int, *, per_scene: int = 5, seed: int = 0
+) -> Tensor:
+    """Draw a set of new goals; the same for whoever asks for the same.
+
+    Args:
+        scenes: the world.
+        trained: (G,) global ids of the goals trained on.
+        kind: of :data:`KINDS`.
+        index: which set of that kind.
+        per_scene: goals of each scene that has trained ones.
+        seed: of all draws.
+
+    Returns:
+        (S * per_scene,) int64 global ids, scene by scene.
+
+    Raises:
+        GoalError: an unknown kind, or a scene with fewer states of it.
+
+    >>> rooms = SceneSet.bundled(["bathroom"])
+    >>> goals = new_goals(rooms, torch.tensor([0, 73]), "1-step", 0, per_scene=3)
+    >>> [min(int(rooms.distance(goal, torch.tensor(t))) for t in (0, 73)) for goal in goals]
+    [1, 1, 1]
+    """
+    if kind not in KINDS:
+        raise GoalError(f"new goals are of the kind {kind!r}; give one of {', '.join(KINDS)}")
+    generator = torch.Generator().manual_seed((seed * 1000 + index) * len(KINDS) + list(KINDS).index(kind))
+    steps, found = KINDS[kind], []
+    for number, scene in enumerate(scenes.scenes):
+        first = int(scenes.offsets[number])
+        here = trained.cpu()[(trained.cpu() >= first) & (trained.cpu() < first + scene.num_states)] - first
+        if not len(here):
+            continue
+        way = scene.distance[:, here].to(torch.int64)
+        nearest = torch.where(way < 0, torch.iinfo(torch.int64).max, way).amin(1)
+        reached = (scene.distance >= 0).all(0)  # from everywhere, so that every episode can succeed
+        allowed = reached & (nearest == steps if steps is not None else nearest > 0)
+        candidates = allowed.nonzero().squeeze(-1)
+        if len(candidates) < per_scene:
+            raise GoalError(
+                f"scene {scene.name!r} has {len(candidates)} states of the kind {kind!r}; {per_scene} are"
+                " wanted: give fewer, or other trained goals"
+            )
+        chosen = candidates[torch.randperm(len(candidates), generator=generator)[:per_scene]]
+        found.append(chosen.sort().values + first)
+    return torch.cat(found)
+
+
+def area_under(frames: Sequence[float], values: Sequence[float]) -> float:
+    """Mean height of a curve over its frames, by trapezia: of episode lengths, less is faster learning.
+
+    >>> area_under([0, 10, 30], [4.0, 2.0, 2.0])
+    2.3333333333333335
+    """
+    if len(frames) != len(values) or len(frames) < 2:
+        raise ValueError(f"a curve needs two points or more; there are {len(frames)} and {len(values)}")
+    area = sum(
+        (after - before) * (low + high) / 2
+        for before, after, low, high in zip(frames[:-1], frames[1:], values[:-1], values[1:], strict=True)
+    )
+    return area / (frames[-1] - frames[0])
+
+
+def frames_to(frames: Sequence[float], values: Sequence[float], threshold: float) -> float:
+    """Frames at which a curve first comes down to a threshold, between its points by a straight line; NaN
+    when it does not.
+
+    >>> frames_to([0, 10, 20], [8.0, 4.0, 1.0], 6.0), frames_to([0, 10], [8.0, 7.0], 6.0)
+    (5.0, nan)
+    """
+    if values[0] <= threshold:
+        return float(frames[0])
+    for before, after, high, low in zip(frames[:-1], frames[1:], values[:-1], values[1:], strict=True):
+        if low <= threshold:
+            return before + (after - before) * (high - threshold) / (high - low)
+    return math.nan
