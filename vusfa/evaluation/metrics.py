@@ -21,7 +21,15 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-__all__ = ["length_ratio", "soft_spl", "spl", "success_rate", "weighted_mean"]
+__all__ = [
+    "length_ratio",
+    "soft_spl",
+    "soft_spl_scores",
+    "spl",
+    "spl_scores",
+    "success_rate",
+    "weighted_mean",
+]
 
 
 def success_rate(success: Tensor, length: Tensor, within: int) -> float:
@@ -49,9 +57,17 @@ def spl(success: Tensor, length: Tensor, shortest: Tensor) -> float:
     >>> spl(torch.tensor([True, True, False]), torch.tensor([4, 8, 99]), torch.tensor([4, 4, 4]))
     0.5
     """
+    return spl_scores(success, length, shortest).mean().item()
+
+
+def spl_scores(success: Tensor, length: Tensor, shortest: Tensor) -> Tensor:
+    """:func:`spl` of each episode, (n,) float64.
+
+    >>> spl_scores(torch.tensor([True, True, False]), torch.tensor([4, 8, 99]), torch.tensor([4, 4, 4]))
+    tensor([1.0000, 0.5000, 0.0000], dtype=torch.float64)
+    """
     best = shortest.to(torch.float64)
-    taken = torch.maximum(length.to(torch.float64), best)
-    return torch.where(success, best / taken, 0.0).mean().item()
+    return torch.where(success, best / torch.maximum(length.to(torch.float64), best), 0.0)
 
 
 def soft_spl(length: Tensor, shortest: Tensor, remaining: Tensor) -> float:
@@ -65,10 +81,19 @@ def soft_spl(length: Tensor, shortest: Tensor, remaining: Tensor) -> float:
     >>> soft_spl(torch.tensor([8, 8, 8]), torch.tensor([4, 4, 4]), torch.tensor([0, 1, 7]))
     0.2916666666666667
     """
+    return soft_spl_scores(length, shortest, remaining).mean().item()
+
+
+def soft_spl_scores(length: Tensor, shortest: Tensor, remaining: Tensor) -> Tensor:
+    """:func:`soft_spl` of each episode, (n,) float64.
+
+    >>> soft_spl_scores(torch.tensor([8, 8]), torch.tensor([4, 4]), torch.tensor([0, 1]))
+    tensor([0.5000, 0.3750], dtype=torch.float64)
+    """
     best = shortest.to(torch.float64)
     progress = (1 - remaining / best.clamp(min=1)).clamp(min=0)
     scores = progress * best / torch.maximum(length.to(torch.float64), best)
-    return torch.where((best > 0) & (remaining >= 0), scores, 0.0).mean().item()
+    return torch.where((best > 0) & (remaining >= 0), scores, 0.0)
 
 
 def length_ratio(success: Tensor, length: Tensor, shortest: Tensor) -> float:

@@ -18,7 +18,7 @@ be drawn again at all: its interval tells of the goals alone.
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -26,6 +26,7 @@ from torch import Tensor
 from vusfa.errors import ConfigError
 
 __all__ = [
+    "Draws",
     "Estimate",
     "Sums",
     "bootstrap_improvement",
@@ -35,6 +36,7 @@ __all__ = [
     "improvement",
     "interquartile_mean",
     "interval",
+    "make_draws",
     "paired_difference",
     "resample_counts",
 ]
@@ -46,6 +48,13 @@ class Estimate(NamedTuple):
     value: float
     low: float
     high: float
+
+
+class Draws(NamedTuple):
+    """How often each seed and each goal is drawn in each of R resamples: (R, K) and (R, G) float64."""
+
+    seeds: Tensor
+    goals: Tensor
 
 
 class Sums(NamedTuple):
@@ -102,8 +111,32 @@ def resample_counts(groups: Tensor, resamples: int, generator: torch.Generator) 
     return counts
 
 
+def make_draws(seeds: int, scene: Tensor, *, resamples: int = 2000, seed: int = 0) -> Draws:
+    """Draw seeds, and goals within their scenes, with replacement.
+
+    Args:
+        seeds: K.
+        scene: (G,) int64, of each goal.
+        resamples: R.
+        seed: of the draws.
+
+    >>> draws = make_draws(3, torch.tensor([0, 0, 1]), resamples=4)
+    >>> draws.seeds.sum(1).tolist(), draws.goals.shape
+    ([3.0, 3.0, 3.0, 3.0], torch.Size([4, 3]))
+    """
+    generator = torch.Generator().manual_seed(seed)
+    seed_counts = resample_counts(torch.zeros(seeds, dtype=torch.int64), resamples, generator)
+    return Draws(seed_counts, resample_counts(scene, resamples, generator))
+
+
 def crossed_draws(
-    sums: Sums, scene: Tensor, *, by_scene: bool = False, resamples: int = 2000, seed: int = 0
+    sums: Sums,
+    scene: Tensor,
+    *,
+    by_scene: bool = False,
+    resamples: int = 2000,
+    seed: int = 0,
+    draws: Draws | None = None,
 ) -> tuple[float, Tensor]:
     """The mean (numerators over denominators) and its resamples over seeds and goals.
 
@@ -111,8 +144,8 @@ def crossed_draws(
         sums: (K, G).
         scene: (G,) int64, of each goal.
         by_scene: the mean of the scenes' means, instead of one in which every goal weighs the same.
-        resamples: R.
-        seed: of the draws.
+        resamples, seed: of :func:`make_draws`.
+        draws: made already, for several tables of one shape.
 
     Returns:
         the mean, and (R,) float64.
@@ -123,46 +156,43 @@ def crossed_draws(
     (2.5, [1.0, 2.5, 4.0])
     """
     _check(sums, scene)
-    generator = torch.Generator().manual_seed(seed)
     seeds, goals = sums.numerator.shape
-    seed_counts = resample_counts(torch.zeros(seeds, dtype=torch.int64), resamples, generator)
-    goal_counts = resample_counts(scene, resamples, generator)
-    ones = torch.ones(1, seeds, dtype=torch.float64), torch.ones(1, goals, dtype=torch.float64)
-    value = _weighted(sums, scene, *ones, by_scene).item()
-    return value, _weighted(sums, scene, seed_counts, goal_counts, by_scene)
+    draws = make_draws(seeds, scene, resamples=resamples, seed=seed) if draws is None else draws
+    once = Draws(torch.ones(1, seeds, dtype=torch.float64), torch.ones(1, goals, dtype=torch.float64))
+    return _weighted(sums, scene, once, by_scene).item(), _weighted(sums, scene, draws, by_scene)
 
 
-def _weighted(sums: Sums, scene: Tensor, seed_counts: Tensor, goal_counts: Tensor, by_scene: bool) -> Tensor:
+def _weighted(sums: Sums, scene: Tensor, draws: Draws, by_scene: bool) -> Tensor:
     names = scene.unique() if by_scene else None
     columns = (
         torch.ones(len(scene), 1, dtype=torch.float64)
         if names is None
         else (scene.unsqueeze(1) == names).to(torch.float64)
     )
-    over, under = ((seed_counts @ part.to(torch.float64) * goal_counts) @ columns for part in sums)
+    over, under = ((draws.seeds @ part.to(torch.float64) * draws.goals) @ columns for part in sums)
     return torch.where(under > 0, over / under, math.nan).nanmean(1)
 
 
-def bootstrap_mean(sums: Sums, scene: Tensor, *, level: float = 0.95, **draws: int | bool) -> Estimate:
+def bootstrap_mean(sums: Sums, scene: Tensor, *, level: float = 0.95, **options: Any) -> Estimate:
     """A mean over seeds and goals with its interval; see :func:`crossed_draws` for the arguments.
 
     >>> sums = Sums(torch.tensor([[0.0, 1.0], [0.0, 1.0]]), torch.ones(2, 2))
     >>> bootstrap_mean(sums, torch.tensor([0, 1]))  # a goal in each scene: nothing is left to chance
     Estimate(value=0.5, low=0.5, high=0.5)
     """
-    value, drawn = crossed_draws(sums, scene, **draws)  # type: ignore[arg-type]
+    value, drawn = crossed_draws(sums, scene, **options)
     return interval(value, drawn, level)
 
 
 def paired_difference(
-    first: Sums, second: Sums, scene: Tensor, *, level: float = 0.95, **draws: int | bool
+    first: Sums, second: Sums, scene: Tensor, *, level: float = 0.95, **options: Any
 ) -> Estimate:
     """The first mean less the second, with its interval: in every resample both have the same seeds and the
     same goals.
 
     Args:
         first, second: (K, G), rows of the same seeds and columns of the same goals.
-        scene, level, draws: see :func:`crossed_draws`.
+        scene, level, options: see :func:`crossed_draws`.
 
     >>> sums = Sums(torch.rand(3, 5), torch.ones(3, 5))
     >>> better = Sums(sums.numerator + 1, sums.denominator)
@@ -174,7 +204,7 @@ def paired_difference(
             f"a difference of pairs needs the same seeds and goals; these tables (seeds, goals) are"
             f" {tuple(first.numerator.shape)} and {tuple(second.numerator.shape)}"
         )
-    (one, ones), (two, twos) = (crossed_draws(sums, scene, **draws) for sums in (first, second))  # type: ignore[arg-type]
+    (one, ones), (two, twos) = (crossed_draws(sums, scene, **options) for sums in (first, second))
     return interval(one - two, ones - twos, level)
 
 
