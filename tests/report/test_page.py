@@ -107,13 +107,15 @@ def test_every_seed_on_demand(runs: list[Run]):
     assert [agent["name"] for agent in content["agents"]] == ["vusfa, seed 0", "vusfa, seed 1", "gvf, seed 0"]
 
 
-def test_without_checkpoints_and_without_evaluation(runs: list[Run]):
+def test_without_checkpoints_and_without_evaluation(runs: list[Run], tmp_path: Path):
     bare = [dataclasses.replace(run, checkpoint=None, episodes=None, references=()) for run in runs]
     content, tables = gather(bare, Options())
     assert content["agents"] == []
     assert content["maps"] == []
     assert tables["summary"] == []
     assert len(content["curves"]) > 4
+    (page, *_), _ = write_report(bare, tmp_path / "page.html")
+    assert not any(scene["pictures"]["ids"] for scene in data_of(page)["scenes"].values())
 
 
 def test_no_runs():

@@ -41,6 +41,8 @@ def write_report(
     options.tell("pictures")
     # every state's id and where its picture ends take up to 16 bytes
     states = sum(scene["states"] for scene in content["scenes"].values())
-    add_pictures(content, open_scenes(runs), max(0, int(most - weight) - 16 * states - 1000))
+    room = max(0, int(most - weight) - 16 * states - 1000)
+    shown = content["agents"] or content["maps"]  # nothing else shows pictures
+    add_pictures(content, open_scenes(runs), room if shown else 0)
     page = write_page(out, content)
     return [page, *write_tables(out.with_name(f"{out.stem}_tables"), tables)], tables
