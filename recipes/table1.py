@@ -2,7 +2,7 @@
 
 Every cell trains a model, chooses a checkpoint by the validation goals, and evaluates it on the episodes of
 the manifest that all cells share. Results go to results/EXPERIMENT/MODEL-SEED; what is there is skipped, what
-was cut off goes on. python recipes/tables.py prints the tables.
+was cut off goes on. "untrained" is VUSFA before its first update. python recipes/tables.py prints the tables.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from omegaconf import OmegaConf, open_dict
 
 from vusfa.errors import VusfaError
 from vusfa.evaluation.files import replacing
-from vusfa.evaluation.results import write_cell
+from vusfa.evaluation.results import read_cell, write_cell
 from vusfa.modules.presets import MODELS
 from vusfa.training.cells import choose_checkpoint, measure_checkpoint
 from vusfa.training.launch import compose
@@ -53,38 +53,48 @@ def table1(
     /,
     *,
     experiment: str = "table1",
-    models: list[str] = list(MODELS),  # noqa: B006
+    models: list[str] = ["untrained", *MODELS],  # noqa: B006
     seeds: list[int] = [0, 1, 2, 3, 4],  # noqa: B006
     stages: list[float] = [0.8, 0.9, 1.0],  # noqa: B006
     results: Path = Path("results"),
     runs: Path = Path("runs"),
     manifest: Path | None = None,
+    again: bool = False,
 ) -> None:
     """Run the cells that results do not hold yet, seed by seed.
 
     Args:
         overrides: settings of recipes/train.py, such as preset=paper.
         experiment: name of the table.
-        models: of the four.
+        models: of the four, and untrained.
         seeds: paired: all models get the same ones.
         stages: parts of the training after which a checkpoint is a candidate.
         results: where cells are written.
         runs: where trainings keep their checkpoints.
         manifest: of episodes; that of the bundled rooms when not given.
+        again: measure the cells that are there anew, from the checkpoints that were chosen.
     """
     for seed in seeds:
         for model in models:
             name, began = f"{model}-{seed}", time.monotonic()
-            if (results / experiment / name / "cell.json").exists():
+            run, there = runs / experiment / name, (results / experiment / name / "cell.json").exists()
+            if there and not again:
                 print(f"{results / experiment / name}: already there")
                 continue
-            settings = [*overrides, f"agent.model={model}", f"seed={seed}"]
-            kept = checkpoints(runs / experiment / name, settings, sorted(stages))
-            scores = choose_checkpoint(kept, manifest)
-            cell = measure_checkpoint(next(iter(scores)), experiment, name, settings, manifest)
-            told = {path.name: score for path, score in scores.items()}
-            info = {**cell.info, "validation_spl": told, "cell_s": round(time.monotonic() - began, 1)}
-            print(write_cell(results, dataclasses.replace(cell, info=info)))
+            if there:
+                told = dict(read_cell(results, experiment, name).info)
+                chosen, settings = run / told["checkpoint"], told["overrides"]
+            else:
+                untrained = model == "untrained"
+                settings = [*overrides, f"agent.model={'vusfa' if untrained else model}", f"seed={seed}"]
+                kept = checkpoints(run, settings, [0.0] if untrained else sorted(stages))
+                scores = choose_checkpoint(kept, manifest)
+                chosen = next(iter(scores))
+                told = {"validation_spl": {path.name: score for path, score in scores.items()}}
+                told |= {"model": model, "row": model} if untrained else {}
+            cell = measure_checkpoint(chosen, experiment, name, settings, manifest)
+            told.setdefault("cell_s", round(time.monotonic() - began, 1))
+            print(write_cell(results, dataclasses.replace(cell, info={**cell.info, **told})))
 
 
 if __name__ == "__main__":

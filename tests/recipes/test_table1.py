@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -11,7 +12,7 @@ import torch
 
 from vusfa.envs import resolve_goals
 from vusfa.evaluation.manifest import make_manifest, write_manifest
-from vusfa.evaluation.results import read_cell, read_cells
+from vusfa.evaluation.results import read_cell, read_cells, write_cell
 from vusfa.scenes import SceneSet
 
 SMALL = [
@@ -80,3 +81,16 @@ def test_a_cell_goes_on_where_it_was_cut_off(
 
 def _interrupt(*arguments: object) -> float:
     raise KeyboardInterrupt
+
+
+def test_untrained_and_measured_again(table1: Any, folders: dict[str, Path]) -> None:
+    table1.table1(SMALL, models=["untrained"], seeds=[2], **folders)
+    cell = read_cell(folders["results"], "table1", "untrained-2")
+    assert (cell.info["model"], cell.info["row"], cell.info["frames"]) == ("untrained", "untrained", 0)
+    old = {way: dataclasses.replace(table, remaining=None) for way, table in cell.episodes.items()}
+    write_cell(folders["results"], dataclasses.replace(cell, episodes=old))
+    table1.table1(SMALL, models=["untrained"], seeds=[2], again=True, **folders)
+    anew = read_cell(folders["results"], "table1", "untrained-2")
+    assert anew.info == cell.info
+    for way, table in anew.episodes.items():
+        assert table.equal(cell.episodes[way])

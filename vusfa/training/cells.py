@@ -6,12 +6,14 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import torch
+from tensordict.nn import TensorDictModuleBase
 
 from vusfa.evaluation import Episodes, evaluate
-from vusfa.evaluation.exact import agent_probabilities, exact_goals
+from vusfa.evaluation.exact import exact_goals
 from vusfa.evaluation.manifest import BUNDLED_MANIFEST, Manifest, make_manifest, read_manifest
 from vusfa.evaluation.metrics import spl
 from vusfa.evaluation.results import Cell
+from vusfa.evaluation.tabulated import TabulatedPolicy, sees_one_frame
 from vusfa.modules import Agent
 from vusfa.scenes import SceneSet
 from vusfa.training.facts import run_facts
@@ -64,13 +66,12 @@ def measure_checkpoint(
     """
     agent, scenes, state = load_agent(checkpoint)
     episodes, trained = manifest_for(scenes, state["goals"], manifest), state["goals"]
+    table = TabulatedPolicy(agent, scenes) if sees_one_frame(agent) else None
     tables = {
-        way: walk_manifest(agent, scenes, episodes, trained, f"{name}, {way}", way == "sampled")
+        way: walk_manifest(agent, scenes, episodes, trained, f"{name}, {way}", way == "sampled", policy=table)
         for way in WAYS
     }
-    exact, config = None, agent.config
-    if config["history"] == 1 and config["observation"] == "index" and config["memory"] is None:
-        exact = exact_goals(agent_probabilities(agent.eval()), scenes, agent)
+    exact = None if table is None else exact_goals(table.probabilities, scenes)
     info = {**run_facts(state, overrides), "checkpoint": checkpoint.name}
     return Cell(experiment, name, info, tables, exact)
 
@@ -83,6 +84,7 @@ def walk_manifest(
     title: str,
     sample: bool = True,
     validation: bool = False,
+    policy: TensorDictModuleBase | None = None,
 ) -> Episodes:
     """A manifest's episodes, walked by an agent.
 
@@ -93,10 +95,11 @@ def walk_manifest(
         title: for the line of progress.
         sample: draw actions, or take the likeliest.
         validation: walk the episodes that checkpoints are chosen by, instead of those to report.
+        policy: what acts for the agent; its actor when not given.
     """
     with EvaluationProgress() as progress:
         return evaluate(
-            agent.get_policy_operator(out_keys=["action"]),
+            agent.get_policy_operator(out_keys=["action"]) if policy is None else policy,
             scenes,
             episodes=manifest.episodes(scenes, validation),
             trained=trained,
