@@ -10,6 +10,7 @@
 from vusfa.modules.acting import ActingPolicy, action_logits, draw_actions
 from vusfa.modules.agents import Agent, make_agent, transplant
 from vusfa.modules.bottleneck import GaussianEncoder, LatentSampler
+from vusfa.modules.episodic import TriedActions
 from vusfa.modules.frames import FeatureFrames, PictureFrames
 from vusfa.modules.linear import HistoryLinear, SceneLinear
 from vusfa.modules.policy import PolicyHead, SuccessorPolicyHead
@@ -39,6 +40,7 @@ __all__ = [
     "SuccessorHead",
     "SuccessorPolicyHead",
     "SuccessorValue",
+    "TriedActions",
     "ValueHead",
     "action_logits",
     "draw_actions",
