@@ -163,14 +163,14 @@ def crossed_draws(
 
 
 def _weighted(sums: Sums, scene: Tensor, draws: Draws, by_scene: bool) -> Tensor:
-    names = scene.unique() if by_scene else None
-    columns = (
-        torch.ones(len(scene), 1, dtype=torch.float64)
-        if names is None
-        else (scene.unsqueeze(1) == names).to(torch.float64)
-    )
-    over, under = ((draws.seeds @ part.to(torch.float64) * draws.goals) @ columns for part in sums)
-    return torch.where(under > 0, over / under, math.nan).nanmean(1)
+    """(R,): sum_k seeds[r, k] sum_g goals[r, g] numerator[k, g] over the like, one ratio for each scene."""
+    parts = [scene == index for index in scene.unique()] if by_scene else [slice(None)]
+    ratios = []
+    for part in parts:
+        chosen = draws.goals[:, part]
+        over, under = ((chosen @ table[:, part].T.to(torch.float64) * draws.seeds).sum(1) for table in sums)
+        ratios.append(torch.where(under > 0, over / under, math.nan))
+    return torch.stack(ratios).nanmean(0)
 
 
 def bootstrap_mean(sums: Sums, scene: Tensor, *, level: float = 0.95, **options: Any) -> Estimate:
