@@ -12,7 +12,8 @@ Reinforcement Learning at the Edge of the Statistical Precipice" (arXiv 2108.132
 scenes, with the seeds drawn again within each scene.
 
 Few seeds are few: a bootstrap over five of them gives intervals that are somewhat too narrow. One seed cannot
-be drawn again at all: its interval tells of the goals alone.
+be drawn again at all: its interval tells of the goals alone, and where seeds alone are drawn there is none
+(NaN).
 """
 
 from __future__ import annotations
@@ -237,6 +238,8 @@ def bootstrap_iqm(scores: Tensor, *, level: float = 0.95, resamples: int = 2000,
     """
     drawn = _redrawn(scores.to(torch.float64), resamples, torch.Generator().manual_seed(seed))
     value = interquartile_mean(scores.to(torch.float64).flatten()).item()
+    if len(scores) == 1:
+        return Estimate(value, math.nan, math.nan)
     return interval(value, interquartile_mean(drawn.flatten(1)), level)
 
 
@@ -279,7 +282,10 @@ def bootstrap_improvement(
         )
     generator = torch.Generator().manual_seed(seed)
     one, two = (_redrawn(scores.to(torch.float64), resamples, generator) for scores in (first, second))
-    return interval(improvement(first, second).item(), improvement(one, two), level)
+    value = improvement(first, second).item()
+    if len(first) == 1 or len(second) == 1:
+        return Estimate(value, math.nan, math.nan)
+    return interval(value, improvement(one, two), level)
 
 
 def _redrawn(scores: Tensor, resamples: int, generator: torch.Generator) -> Tensor:
