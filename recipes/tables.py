@@ -26,6 +26,7 @@ from vusfa.evaluation.tables import (
     middle_rows,
     model_rows,
 )
+from vusfa.scenes import SceneSet
 from vusfa.training import set_threads
 
 WAYS = {"sampled": "actions drawn", "greedy": "the likeliest action", "exact": "computed, actions drawn"}
@@ -36,6 +37,7 @@ def tables(
     *,
     results: Path = Path("results"),
     out: Path | None = None,
+    scenes: list[str] | None = None,
     resamples: int = 2000,
     threads: int = 1,
 ) -> None:
@@ -45,12 +47,13 @@ def tables(
         experiments: folders of results, shown together.
         results: where they lie.
         out: folder for the CSV files; RESULTS/tables when not given.
+        scenes: bundled names and files, in order; the bundled rooms that the cells name when not given.
         resamples: of the bootstrap.
         threads: processor threads; more than 1 pays on an idle machine only.
     """
     set_threads(threads)
     folder = check_folder(out or results / "tables", "out")
-    experiment = read_experiment(results, experiments)
+    experiment = read_experiment(results, experiments, SceneSet.open(scenes) if scenes else None)
     names = ["model", "seeds", "num_goals", *MEASURES]
 
     cells = cell_rows(experiment)

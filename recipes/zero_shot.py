@@ -18,6 +18,8 @@ import tyro
 from vusfa.errors import VusfaError
 from vusfa.evaluation import compare, print_summary
 from vusfa.evaluation.files import check_folder
+from vusfa.evaluation.manifest import BUNDLED_MANIFEST, read_manifest
+from vusfa.evaluation.tabulated import TabulatedPolicy, sees_one_frame
 from vusfa.training import (
     EvaluationProgress,
     load_agent,
@@ -35,6 +37,7 @@ def zero_shot(
     episodes: int = 10,
     max_steps: int = 500,
     goals: str = "all",
+    manifest: str | None = None,
     greedy: bool = False,
     unreachable: Literal["skip", "fail"] = "skip",
     seed: int = 0,
@@ -50,6 +53,8 @@ def zero_shot(
         max_steps: actions allowed in an episode.
         goals: all, paper, random:5 (a scene), or a manifest (.yaml).
         greedy: take the most probable action instead of drawing one.
+        manifest: walk the episodes of recipes/table1.py, instead of drawing some: bundled, or a file (.npz).
+            Then episodes, goals, unreachable and the seed of the actions are not looked at.
         unreachable: pairs of start and goal without a path: skip leaves them out, fail counts them as
             failures.
         seed: of starts, actions and the untrained network.
@@ -61,12 +66,20 @@ def zero_shot(
     stem = out or checkpoint.with_name("zero_shot")
     check_folder(stem.parent, "out")
     agent, scenes, state = load_agent(checkpoint, device=device)
+    walks = (
+        None if manifest is None else read_manifest(BUNDLED_MANIFEST if manifest == "bundled" else manifest)
+    )
     torch.manual_seed(seed)
     untrained = rebuild_agent(agent.config, scenes).to(device)
     policies = {row_name(state["config"]): agent, "untrained": untrained}
     with EvaluationProgress() as progress:
         result = compare(
-            {name: policy.get_policy_operator() for name, policy in policies.items()},
+            {
+                name: TabulatedPolicy(policy, scenes)
+                if sees_one_frame(policy) and goals == "all"
+                else policy.get_policy_operator()
+                for name, policy in policies.items()
+            },
             scenes,
             goals,
             trained=state["goals"],
@@ -77,8 +90,10 @@ def zero_shot(
             observe=make_observation(agent, scenes),
             sample=not greedy,
             unreachable=unreachable,
-            seed=seed,
+            seed=seed if walks is None else walks.seed,
+            episodes=None if walks is None else walks.episodes(scenes),
         )
+    result.settings["manifest"] = manifest
     print_summary(result.rows, note=result.note)
     for path in result.save(stem):
         print(path)

@@ -14,7 +14,7 @@ from vusfa.errors import ResultError
 from vusfa.evaluation import Episodes, episode_starts, evaluate, random_walk
 from vusfa.evaluation.exact import exact_goals
 from vusfa.evaluation.experiment import Experiment, episode_sums, nearest_trained, read_experiment
-from vusfa.evaluation.results import Cell, write_cell
+from vusfa.evaluation.results import Cell, read_cell, write_cell
 from vusfa.scenes import Scene, SceneSet
 
 Policies = dict[str, Callable[..., Any]]
@@ -109,6 +109,15 @@ def test_other_episodes_are_refused(results: Path, rooms: SceneSet, walked: Call
         read_experiment(results, ["a"], rooms)
     with pytest.raises(ResultError, match="no results of b or c"):
         read_experiment(results, ["b", "c"], rooms)
+
+
+def test_other_scenes_are_refused(results: Path, rooms: SceneSet) -> None:
+    cell = read_cell(results, "a", "gvf-0")
+    told = {**cell.info, "scenes_fingerprint": "abc", "scenes": ["bathroom"]}
+    write_cell(results, replace(cell, info=told))
+    for scenes in (rooms, None):
+        with pytest.raises(ResultError, match=r"a/gvf-0: of other scenes \(fingerprint abc"):
+            read_experiment(results, ["a"], scenes)
 
 
 def test_distance_from_the_nearest_trained_goal(make_scene: Callable[..., Scene]) -> None:

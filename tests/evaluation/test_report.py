@@ -157,7 +157,7 @@ def test_compare_puts_everything_side_by_side(rooms: SceneSet, policies, tmp_pat
         rows = list(csv.DictReader(file))
     assert len(rows) == len(result.rows) == 4 * 3 * 4
     assert rows[0]["policy"] == "guide"
-    assert float(rows[0]["success_40"]) == 1.0
+    assert float(rows[0]["success_40"]) == float(rows[0]["soft_spl"]) == 1.0
     read = json.loads(content.read_text())
     assert read["settings"]["episodes_per_goal"] == 2
     assert read["settings"]["scenes"] == ["hall", "attic"]

@@ -180,6 +180,14 @@ def test_improvement_of_one_scene_is_scipys():
     assert (found.low, found.high) == pytest.approx((low, high), abs=0.02)
 
 
+def test_one_seed_cannot_be_drawn_again():
+    one, three = drawn(1, 4), drawn(3, 4)
+    for found in (bootstrap_iqm(one), bootstrap_improvement(one, three), bootstrap_improvement(three, one)):
+        assert not math.isnan(found.value)
+        assert math.isnan(found.low)
+        assert math.isnan(found.high)
+
+
 def test_tables_that_do_not_fit():
     sums = means(torch.ones(2, 3))
     with pytest.raises(ConfigError, match="scene for each goal"):

@@ -137,12 +137,14 @@ def test_rows_as_text() -> None:
     rows = [
         {"model": "a", "seed": 1, "solved": True, "spl": Estimate(0.1234, 0.1, 0.2), "frames": 1000},
         {"model": "b", "seed": 2, "solved": False, "length_ratio": Estimate(math.nan, math.nan, math.nan)},
+        {"model": "c", "solved": True, "length_ratio": Estimate(1.5, math.nan, math.nan)},
     ]
     assert markdown(rows, ["model", "solved", "spl", "length_ratio", "frames", "none"]).splitlines() == [
         "| model | solved | SPL, % | length / shortest | frames |",
         "|---|---|---|---|---|",
         "| a | yes | 12.3 [10.0, 20.0] | – | 1,000 |",
         "| b | no | – | – | – |",
+        "| c | yes | – | 1.50 | – |",
     ]
     flat = flat_rows(rows)
     assert flat[0]["spl_high"] == 0.2

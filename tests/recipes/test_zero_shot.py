@@ -11,6 +11,12 @@ from pathlib import Path
 import pytest
 import torch
 
+from vusfa.envs import resolve_goals
+from vusfa.errors import ResultError
+from vusfa.evaluation.manifest import make_manifest, write_manifest
+from vusfa.evaluation.results import read_cell
+from vusfa.scenes import SceneSet
+
 ZERO_SHOT = Path(__file__).parents[2] / "recipes" / "zero_shot.py"
 
 
@@ -57,6 +63,34 @@ def test_same_seed_same_table(recipe, settings, small, tmp_path: Path):
         )
         found.append([(tmp_path / f"{name}{suffix}").read_text() for suffix in (".csv", "_episodes.csv")])
     assert found[0] == found[1]
+
+
+def test_the_episodes_of_a_manifest(recipe, tmp_path: Path):
+    """Those of recipes/table1.py, number for number."""
+    options = [
+        "agent.model=vusfa", "agent.hidden_size=8", "agent.embedding_size=8", "agent.history=1",
+        "scenes=[bathroom]", "total_frames=32", "collector.num_envs=8", "collector.rollout=4",
+    ]  # fmt: skip
+    rooms = SceneSet.bundled(["bathroom"])
+    drawn = make_manifest(rooms, resolve_goals(rooms, "paper"), episodes_per_goal=2, validation_goals=3)
+    manifest = write_manifest(tmp_path / "episodes.npz", drawn)
+    results, runs = tmp_path / "results", tmp_path / "runs"
+    recipe("table1").table1(
+        options, models=["vusfa"], seeds=[0], stages=[1.0], results=results, runs=runs, manifest=manifest
+    )
+    checkpoint = runs / "table1" / "vusfa-0" / "checkpoint-100.pt"
+    recipe("zero_shot").zero_shot(checkpoint, manifest=str(manifest), seed=5)
+    table = read_cell(results, "table1", "vusfa-0").episodes["sampled"]
+    with open(checkpoint.with_name("zero_shot_episodes.csv"), newline="") as file:
+        assert list(csv.DictReader(file)) == [
+            {key: str(int(value) if isinstance(value, bool) else value) for key, value in row.items()}
+            for row in table.rows()
+        ]
+    settings = json.loads(checkpoint.with_name("zero_shot.json").read_text())["settings"]
+    assert settings["manifest"] == str(manifest)
+    assert len(settings["goals"]) == 176 - 3
+    with pytest.raises(ResultError, match="of other scenes"):
+        recipe("zero_shot").zero_shot(checkpoint, manifest="bundled")
 
 
 def test_as_a_command(tmp_path: Path):

@@ -111,12 +111,13 @@ def compare(
         trained: global ids of the goals that the first policy was trained on.
         within: numbers of actions to give the success for.
         progress: called with (policy, episodes finished, episodes in all).
-        settings: of :func:`vusfa.evaluation.evaluate`.
+        settings: of :func:`vusfa.evaluation.evaluate`. With ``episodes``, the goals are theirs.
 
     Raises:
         GoalError: a goal that does not exist, or none that can be reached.
     """
-    goal_ids = resolve_goals(scenes, goals)
+    given = settings.get("episodes")
+    goal_ids = resolve_goals(scenes, goals) if given is None else given[1].unique()
     rows: list[dict[str, Any]] = []
     tables: list[Episodes] = []
     for name, policy in policies.items():
@@ -128,8 +129,9 @@ def compare(
     limit = tables[0].max_steps
     rows += random_walk_summary(scenes, goal_ids, trained, limit, within, unreachable)
     rows += summary(shortest_paths(tables[0]), "shortest path", within)
-    plain = {key: value for key, value in settings.items() if key != "observe"}
-    plain |= {"scenes": list(scenes.names), "goals": goals if isinstance(goals, str) else goal_ids.tolist()}
+    plain = {key: value for key, value in settings.items() if key not in ("observe", "episodes")}
+    named = goals if isinstance(goals, str) and given is None else goal_ids.tolist()
+    plain |= {"scenes": list(scenes.names), "goals": named}
     return Comparison(tables[0], rows, plain, count_pairs(scenes.scenes, unreachable))
 
 

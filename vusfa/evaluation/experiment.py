@@ -150,7 +150,7 @@ def read_experiment(root: str | Path, names: Sequence[str], scenes: SceneSet | N
         scenes: the world; those that the cells name when not given.
 
     Raises:
-        ResultError: there is no cell, one is damaged, or one has other episodes.
+        ResultError: there is no cell, one is damaged, or one has other episodes; the scenes are others.
     """
     cells = [cell for name in names for cell in read_cells(root, name) if cell.episodes]
     if not cells:
@@ -168,6 +168,13 @@ def read_experiment(root: str | Path, names: Sequence[str], scenes: SceneSet | N
                     f" {cells[0].name}; give experiments of one manifest and the same trained goals"
                 )
     scenes = SceneSet.open(list(cells[0].info["scenes"])) if scenes is None else scenes
+    walked = cells[0].info.get("scenes_fingerprint", scenes.fingerprint)
+    if walked != scenes.fingerprint:
+        where = Path(root) / cells[0].experiment / cells[0].name
+        raise ResultError(
+            f"{where}: of other scenes (fingerprint {walked[:12]}, and"
+            f" {', '.join(scenes.names)} have {scenes.fingerprint[:12]}); give those that it was walked in"
+        )
     groups: dict[str, list[Cell]] = {}
     for cell in sorted(cells, key=_order):
         groups.setdefault(row_label(cell.info), []).append(cell)

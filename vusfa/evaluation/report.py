@@ -16,7 +16,7 @@ from torch import Tensor
 
 from vusfa.evaluation.episodes import Episodes
 from vusfa.evaluation.floors import random_walk
-from vusfa.evaluation.metrics import length_ratio, spl, success_rate, weighted_mean
+from vusfa.evaluation.metrics import length_ratio, soft_spl, spl, success_rate, weighted_mean
 from vusfa.evaluation.navigation import Unreachable
 from vusfa.scenes import Scene, SceneSet
 
@@ -56,8 +56,8 @@ def summary(episodes: Episodes, policy: str, within: Sequence[int] = (500, 100))
 
     Returns:
         rows with policy, goals (trained, unseen or all), scene, num_goals, num_episodes, success_k, spl,
-        length (of the successful episodes), length_ratio (see :func:`vusfa.evaluation.metrics.length_ratio`)
-        and collisions (a episode).
+        soft_spl, length (of the successful episodes), length_ratio (see
+        :func:`vusfa.evaluation.metrics.length_ratio`) and collisions (in an episode).
 
     >>> one = torch.tensor([1, 1])
     >>> scene = torch.tensor([0, 1])
@@ -115,7 +115,7 @@ def random_walk_summary(
                 row: Row = {"policy": "random walk", "goals": subset, "scene": scene.name}
                 row |= {"num_goals": success.shape[1], "num_episodes": math.nan}
                 row |= {f"success_{k}": rate.mean().item() for k, rate in zip(limits, success, strict=True)}
-                per_scene.append(row | dict.fromkeys(_HEADS, math.nan))
+                per_scene.append(row | dict.fromkeys(("soft_spl", *_HEADS), math.nan))
         rows += _with_averages(per_scene)
     return rows
 
@@ -196,9 +196,11 @@ def _counts(episodes: Episodes) -> Row:
 
 def _measures(episodes: Episodes, limits: Sequence[int]) -> Row:
     success, length, shortest = episodes.success, episodes.length, episodes.shortest
+    left = episodes.remaining
     return {
         **{f"success_{k}": success_rate(success, length, k) for k in limits},
         "spl": spl(success, length, shortest),
+        "soft_spl": math.nan if left is None else soft_spl(length, shortest, left),
         "length": length[success].to(torch.float64).mean().item(),
         "length_ratio": length_ratio(success, length, shortest),
         "collisions": episodes.collisions.to(torch.float64).mean().item(),

@@ -12,7 +12,8 @@ Reinforcement Learning at the Edge of the Statistical Precipice" (arXiv 2108.132
 scenes, with the seeds drawn again within each scene.
 
 Few seeds are few: a bootstrap over five of them gives intervals that are somewhat too narrow. One seed cannot
-be drawn again at all: its interval tells of the goals alone.
+be drawn again at all: its interval tells of the goals alone, and where seeds alone are drawn there is none
+(NaN).
 """
 
 from __future__ import annotations
@@ -163,14 +164,14 @@ def crossed_draws(
 
 
 def _weighted(sums: Sums, scene: Tensor, draws: Draws, by_scene: bool) -> Tensor:
-    names = scene.unique() if by_scene else None
-    columns = (
-        torch.ones(len(scene), 1, dtype=torch.float64)
-        if names is None
-        else (scene.unsqueeze(1) == names).to(torch.float64)
-    )
-    over, under = ((draws.seeds @ part.to(torch.float64) * draws.goals) @ columns for part in sums)
-    return torch.where(under > 0, over / under, math.nan).nanmean(1)
+    """(R,): sum_k seeds[r, k] sum_g goals[r, g] numerator[k, g] over the like, one ratio for each scene."""
+    parts = [scene == index for index in scene.unique()] if by_scene else [slice(None)]
+    ratios = []
+    for part in parts:
+        chosen = draws.goals[:, part]
+        over, under = ((chosen @ table[:, part].T.to(torch.float64) * draws.seeds).sum(1) for table in sums)
+        ratios.append(torch.where(under > 0, over / under, math.nan))
+    return torch.stack(ratios).nanmean(0)
 
 
 def bootstrap_mean(sums: Sums, scene: Tensor, *, level: float = 0.95, **options: Any) -> Estimate:
@@ -237,6 +238,8 @@ def bootstrap_iqm(scores: Tensor, *, level: float = 0.95, resamples: int = 2000,
     """
     drawn = _redrawn(scores.to(torch.float64), resamples, torch.Generator().manual_seed(seed))
     value = interquartile_mean(scores.to(torch.float64).flatten()).item()
+    if len(scores) == 1:
+        return Estimate(value, math.nan, math.nan)
     return interval(value, interquartile_mean(drawn.flatten(1)), level)
 
 
@@ -279,7 +282,10 @@ def bootstrap_improvement(
         )
     generator = torch.Generator().manual_seed(seed)
     one, two = (_redrawn(scores.to(torch.float64), resamples, generator) for scores in (first, second))
-    return interval(improvement(first, second).item(), improvement(one, two), level)
+    value = improvement(first, second).item()
+    if len(first) == 1 or len(second) == 1:
+        return Estimate(value, math.nan, math.nan)
+    return interval(value, improvement(one, two), level)
 
 
 def _redrawn(scores: Tensor, resamples: int, generator: torch.Generator) -> Tensor:

@@ -154,7 +154,8 @@ def middle_rows(experiment: Experiment, way: str, resamples: int = 2000) -> list
 
 
 def comparison_rows(experiment: Experiment, way: str, resamples: int = 2000) -> list[Row]:
-    """Each model against the one before it, the last against the first, and all against the random walk.
+    """Each model against the one before it, the last against the first, and all against the untrained network
+    and the random walk.
 
     Args:
         experiment, way, resamples: see :func:`model_rows`.
@@ -167,7 +168,9 @@ def comparison_rows(experiment: Experiment, way: str, resamples: int = 2000) -> 
     four = [name for name in MODELS if name in experiment.cells]
     pairs = [*zip(four[1:], four, strict=False)]
     pairs += [(four[-1], four[0])] if len(four) > 2 else []
-    pairs += [(label, four[-1]) for label in experiment.cells if four and label not in MODELS]
+    extra = [label for label in experiment.cells if label not in (*MODELS, "untrained")]
+    pairs += [(label, four[-1]) for label in extra if four]
+    pairs += [(name, "untrained") for name in four if "untrained" in experiment.cells]
     pairs += [(label, RANDOM_WALK) for label in experiment.cells]
     rows, draws = [], _cached_draws(resamples)
     for subset, mask in _subsets(experiment).items():
@@ -239,7 +242,8 @@ def _text(name: str, value: Any) -> str:
     _, scale, digits = MEASURES.get(name, ("", 100.0, 1))
     if isinstance(value, Estimate):
         low, high = (f"{scale * end:.{digits}f}" for end in value[1:])
-        return "–" if math.isnan(value.value) else f"{scale * value.value:.{digits}f} [{low}, {high}]"
+        ends = "" if math.isnan(value.low) else f" [{low}, {high}]"
+        return "–" if math.isnan(value.value) else f"{scale * value.value:.{digits}f}{ends}"
     if isinstance(value, bool):
         return "yes" if value else "no"
     if name == "trained" and isinstance(value, float):
