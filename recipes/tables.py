@@ -63,10 +63,12 @@ def tables(
         ["model", "seed", "frames", "checkpoint", "training_s", "trained", "solved", "exact_z"],
     )
     unsolved = [
-        f"{row['model']} of seed {row['seed']} ({row['trained']:.1%})" for row in cells if not row["solved"]
+        f"{row['model']} of seed {row['seed']} ({100 * row['trained']:.1f} % after {row['frames']:,} frames)"
+        for row in cells
+        if row["frames"] and not row["solved"]
     ]
     if unsolved:
-        print(f"Trained goals NOT solved (success below 90 %): {', '.join(unsolved)}.\n")
+        print(f"Trained goals NOT solved (success below 90 %): {'; '.join(unsolved)}.\n")
     every, far, middle, compared = [], [], [], []
     for way, words in WAYS.items():
         found = model_rows(experiment, way, resamples)
