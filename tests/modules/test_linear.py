@@ -28,6 +28,13 @@ class TestSceneLinear:
         assert out.tolist() == [[17.0], [16.0], [15.0]]
 
     @given(scene_id=st.lists(st.integers(0, 3), min_size=1, max_size=12), wide=st.booleans())
+    def test_sorted_rows_that_are_counted(self, scene_id: list[int], wide: bool) -> None:
+        layer = SceneLinear(4, 5, 40 if wide else 4)
+        x, scene = torch.randn(len(scene_id), 5), torch.tensor(sorted(scene_id))
+        rows = linear.SceneRows(scene, [scene_id.count(number) for number in range(4)])
+        torch.testing.assert_close(layer(x, rows), by_rows(layer, x, scene))
+
+    @given(scene_id=st.lists(st.integers(0, 3), min_size=1, max_size=12), wide=st.booleans())
     def test_each_row_meets_its_own_scene(self, scene_id: list[int], wide: bool) -> None:
         """Narrow outputs are computed for all scenes and picked, wide ones by sorting."""
         out_features = 40 if wide else 4

@@ -16,6 +16,7 @@ from tensordict.nn import TensorDictModuleBase
 from tensordict.nn.probabilistic import InteractionType, interaction_type
 from torch import Tensor
 
+from vusfa.modules.linear import SceneRows
 from vusfa.modules.policy import SuccessorPolicyHead
 from vusfa.modules.trunk import SiameseTrunk
 
@@ -25,14 +26,14 @@ if TYPE_CHECKING:
 __all__ = ["ActingPolicy", "action_logits", "draw_actions"]
 
 
-def action_logits(agent: Agent, state: Tensor, goal: Tensor, scene_id: Tensor) -> Tensor:
+def action_logits(agent: Agent, state: Tensor, goal: Tensor, scene_id: Tensor | SceneRows) -> Tensor:
     """An agent's logits, without anything else that its actor writes on the way.
 
     Args:
         agent: one without a memory.
         state: (R, H) int64 ids, oldest first, or observations (R, H, ...), as the agent reads them.
         goal: (R,) ids, or observations (R, ...).
-        scene_id: (R,) int64.
+        scene_id: (R,) int64; or, of rows sorted by scene, with the counts.
 
     Returns:
         (R, A) float32.
@@ -123,8 +124,9 @@ class ActingPolicy(TensorDictModuleBase):
         )
 
     def _logits(self, state: Tensor, goal: Tensor, scene: Tensor) -> Tensor:
-        if self._num_scenes == 1:
+        if self._num_scenes == 1 or scene.is_cuda:  # there counting means waiting for the device
             return action_logits(self.agent, state, goal, scene)
         scene, order = scene.sort(stable=True)
-        logits = action_logits(self.agent, state[order], goal[order], scene)
+        rows = SceneRows(scene, torch.bincount(scene, minlength=self._num_scenes).tolist())
+        logits = action_logits(self.agent, state[order], goal[order], rows)
         return torch.empty_like(logits).index_copy_(0, order, logits)

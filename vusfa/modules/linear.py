@@ -7,17 +7,30 @@ released code.
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-__all__ = ["HistoryLinear", "SceneLinear"]
+__all__ = ["HistoryLinear", "SceneLinear", "SceneRows"]
 
 #: At most this many outputs a row are computed for nothing before rows are sorted by scene instead.
 _DENSE_OUTPUTS = 64
 #: On an accelerator sorting means waiting for it, so a few scenes are all computed there.
 _DENSE_SCENES = 8
+
+
+class SceneRows(NamedTuple):
+    """Rows sorted by scene, counted once for all the layers that read them.
+
+    Attributes:
+        scene: (R,) int64, ascending.
+        counts: rows of each scene.
+    """
+
+    scene: Tensor
+    counts: list[int]
 
 
 class SceneLinear(nn.Module):
@@ -62,11 +75,17 @@ class SceneLinear(nn.Module):
         """Draws weights and biases anew, uniform in +-1/sqrt(in_features)."""
         _uniform_(self.weight, self.bias, fan_in=self.in_features)
 
-    def forward(self, x: Tensor, scene_id: Tensor) -> Tensor:
-        """Maps (\\*B, in) with scene indices (\\*B,) int64 to (\\*B, out)."""
+    def forward(self, x: Tensor, scene_id: Tensor | SceneRows) -> Tensor:
+        """Maps (\\*B, in) with scene indices (\\*B,) int64 to (\\*B, out); rows sorted by scene, (R, in), may
+        come with their :class:`SceneRows`."""
         weight, bias = self._weights(x)
         if self.num_scenes == 1:
             return functional.linear(x, weight.squeeze(0), bias.squeeze(0))
+        if isinstance(scene_id, SceneRows):
+            if self.num_scenes * self.out_features <= _DENSE_OUTPUTS:
+                return self._all_scenes(x, scene_id.scene, weight, bias)
+            parts = self._products(x, scene_id.counts, weight.unbind(0), bias.unbind(0))
+            return parts[0] if len(parts) == 1 else torch.cat(parts)
         rows, scene = x.reshape(-1, self.in_features), scene_id.reshape(-1)
         if self.num_scenes * self.out_features <= _DENSE_OUTPUTS or (
             rows.is_cuda and self.num_scenes <= _DENSE_SCENES

@@ -9,7 +9,7 @@ from __future__ import annotations
 from torch import Tensor, nn
 from torch.nn import functional
 
-from vusfa.modules.linear import SceneLinear
+from vusfa.modules.linear import SceneLinear, SceneRows
 
 __all__ = ["RewardHead", "SuccessorHead", "SuccessorValue", "ValueHead"]
 
@@ -34,7 +34,7 @@ class SuccessorHead(nn.Module):
         self.linear = SceneLinear(num_scenes, hidden_size, embedding_size)
         self.scale = scale
 
-    def forward(self, hidden: Tensor, scene_id: Tensor) -> Tensor:
+    def forward(self, hidden: Tensor, scene_id: Tensor | SceneRows) -> Tensor:
         """(\\*B, hidden_size) with scene indices (\\*B,) to (\\*B, E) float32."""
         return self.scale * self.linear(hidden, scene_id).float()
 
@@ -89,6 +89,6 @@ class ValueHead(nn.Module):
         super().__init__()
         self.linear = SceneLinear(num_scenes, hidden_size, 1)
 
-    def forward(self, hidden: Tensor, scene_id: Tensor) -> Tensor:
+    def forward(self, hidden: Tensor, scene_id: Tensor | SceneRows) -> Tensor:
         """(\\*B, hidden_size) with scene indices (\\*B,) to (\\*B, 1) float32."""
         return self.linear(hidden, scene_id).float()

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 from torch import Tensor, nn
 from torch.nn import functional
 
-from vusfa.modules.linear import SceneLinear
+from vusfa.modules.linear import SceneLinear, SceneRows
 
 __all__ = ["Fusion", "SceneLayer", "SiameseTrunk"]
 
@@ -110,6 +110,6 @@ class SceneLayer(nn.Module):
         super().__init__()
         self.linear = SceneLinear(num_scenes, in_features, hidden_size)
 
-    def forward(self, fused: Tensor, scene_id: Tensor) -> Tensor:
+    def forward(self, fused: Tensor, scene_id: Tensor | SceneRows) -> Tensor:
         """(\\*B, in) with scene indices (\\*B,) to (\\*B, hidden_size)."""
         return functional.relu(self.linear(fused, scene_id))
