@@ -82,8 +82,10 @@ def table1(
                 print(f"{results / experiment / name}: already there")
                 continue
             if there:
-                told = dict(read_cell(results, experiment, name).info)
-                chosen, settings = run / told["checkpoint"], told["overrides"]
+                info = read_cell(results, experiment, name).info
+                chosen, settings = run / info["checkpoint"], info["overrides"]
+                told = {key: info[key] for key in ("validation_spl", "cell_s") if key in info}
+                told |= {"model": model, "row": model} if model == "untrained" else {}
             else:
                 untrained = model == "untrained"
                 settings = [*overrides, f"agent.model={'vusfa' if untrained else model}", f"seed={seed}"]

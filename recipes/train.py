@@ -45,6 +45,9 @@ def train(cfg: DictConfig, overrides: list[str]) -> tuple[Session, Comparison | 
     plain: dict[str, Any] = OmegaConf.to_container(cfg, resolve=True)  # type: ignore[assignment]
     training = make_training(plain, overrides)
     session = training.session
+    if training.reconstructed is not None:
+        share = 100 * training.reconstructed
+        print(f"autoencoder: explains {share:.1f} % of the features' variance", file=sys.stderr)
     scenes, goals, agent = session.scenes, session.goals, session.agent
     measured = dict(plain["evaluation"])
     wanted = measured.pop("goals")

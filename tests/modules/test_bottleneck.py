@@ -2,9 +2,10 @@ from __future__ import annotations
 
 import pytest
 import torch
+from tensordict import TensorDict
 
 from vusfa.errors import ConfigError
-from vusfa.modules import FeatureFrames, GaussianEncoder, LatentSampler, SiameseEncoder
+from vusfa.modules import FeatureFrames, GaussianEncoder, LatentSampler, SiameseEncoder, make_agent
 from vusfa.scenes import SceneSet
 
 
@@ -82,3 +83,19 @@ class TestLatentSampler:
         assert LatentSampler("sample").eval()(loc, scale).any()
         with pytest.raises(ConfigError, match="eval_latent is 'median'"):
             LatentSampler("median")
+
+
+def test_actions_do_not_depend_on_how_the_latent_is_read() -> None:
+    """Only omega reads z_g, and no policy reads omega: mean and sampled latents walk alike."""
+
+    rooms = SceneSet.bundled(["bathroom"])
+    logits, values = [], []
+    for latent in ("mean", "sample"):
+        torch.manual_seed(0)
+        agent = make_agent("vusfa", scenes=rooms, history=1, hidden_size=16, eval_latent=latent).eval()
+        rows = {"state_id": torch.arange(176).unsqueeze(-1), "goal_id": torch.arange(176).flip(0)}
+        inputs = TensorDict({**rows, "scene_id": torch.zeros(176, dtype=torch.int64)}, [176])
+        logits.append(agent.get_policy_operator().get_dist(inputs.clone()).logits)
+        values.append(agent.get_value_operator()(inputs.clone())["state_value"])
+    assert torch.equal(*logits)
+    assert not torch.equal(*values)

@@ -91,3 +91,23 @@ def test_entropy_and_rate_follow_the_frames(scene_file: Path, updates: int):
 def test_what_hindsight_cannot_do_is_said(scene_file: Path, overrides: list[str], words: str):
     with pytest.raises(ConfigError, match=words):
         made(scene_file, *HINDSIGHT, *overrides)
+
+
+def test_an_autoencoders_phi_and_regressed_rewards(scene_file: Path):
+    training = made(scene_file, "preset=autoencoder")
+    agent = training.session.agent
+    before = {name: value.clone() for name, value in agent.state_dict().items()}
+    terms = run(training, 3)
+    moved = {
+        name.split(".")[0] for name, value in agent.state_dict().items() if not value.equal(before[name])
+    }
+    assert moved == {"fusion", "scene_layer", "successor", "reward", "policy"}
+    assert terms["loss_reward"].item() > 0
+    assert terms["loss_critic"].item() == 0
+    assert training.reconstructed is not None
+    assert 0 < training.reconstructed <= 1
+
+
+def test_regression_of_the_reward_needs_reward_weights(scene_file: Path):
+    with pytest.raises(ConfigError, match=r"objective\.reward_coeff is 0\.5.*reward_weights"):
+        made(scene_file, "agent.model=gvf", "objective.reward_coeff=0.5")

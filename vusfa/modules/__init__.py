@@ -9,6 +9,7 @@
 
 from vusfa.modules.acting import ActingPolicy, action_logits, draw_actions
 from vusfa.modules.agents import Agent, make_agent, transplant
+from vusfa.modules.autoencoder import explained_features, pretrain_autoencoder
 from vusfa.modules.bottleneck import GaussianEncoder, LatentSampler
 from vusfa.modules.episodic import TriedActions
 from vusfa.modules.frames import FeatureFrames, PictureFrames
@@ -44,8 +45,10 @@ __all__ = [
     "ValueHead",
     "action_logits",
     "draw_actions",
+    "explained_features",
     "frozen",
     "make_agent",
+    "pretrain_autoencoder",
     "resolve_config",
     "transplant",
 ]

@@ -143,6 +143,7 @@ class Agent(nn.Module):
         ideas, size, hidden = config.ideas, config.embedding_size, config.hidden_size
         num_scenes = 1 if config.shared_heads else scenes.num_scenes
         self.encoder: nn.Module = _make_encoder(config, scenes)
+        self.encoder.requires_grad_(config.pretrained is None)
         self.fusion = Fusion(size, hidden)
         self.scene_layer = SceneLayer(num_scenes, hidden, hidden)
         self.latent = LatentSampler(config.eval_latent) if ideas.bottleneck else None

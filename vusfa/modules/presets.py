@@ -77,6 +77,7 @@ _OURS_ALONE = (
     "reward_scale",
     "initial_scale",
     "shared_heads",
+    "pretrained",
 )
 
 
@@ -103,6 +104,8 @@ class AgentConfig:
         memory: ``"lstm"``: a recurrent layer behind the fusion of state and goal.
         shared_heads: the scene layer, psi, the value and the policy have one set of weights for all scenes
             and do not read which scene it is; :func:`~vusfa.modules.transplant` takes it to others.
+        pretrained: ``"autoencoder"``: the encoder's weights are constants, made by
+            :func:`~vusfa.modules.pretrain_autoencoder`.
         successor_norm: how psi is normalised on its way into the policy: ``None``, ``"rms"``, ``"layer"``.
         successor_gain: factor on psi on that way.
         successor_scale: factor on the psi layer's output, about 1 / (1 - gamma).
@@ -128,6 +131,7 @@ class AgentConfig:
     state_layer: bool = False
     memory: Literal["lstm"] | None = None
     shared_heads: bool = False
+    pretrained: Literal["autoencoder"] | None = None
     successor_norm: Literal["rms", "layer"] | None = None
     successor_gain: float = 1.0
     successor_scale: float = 1.0
@@ -188,6 +192,7 @@ def _checked(config: AgentConfig) -> AgentConfig:
         ("observation", ("index", "features", "pixels")),
         ("encoder", ("mlp", "conv")),
         ("memory", (None, "lstm")),
+        ("pretrained", (None, "autoencoder")),
         ("successor_norm", (None, "rms", "layer")),
         ("scale", ("softplus", "raw")),
         ("eval_latent", ("mean", "sample")),
@@ -205,6 +210,16 @@ def _checked(config: AgentConfig) -> AgentConfig:
     if config.encoder == "conv" and config.normalise_features:
         raise ConfigError(
             "normalise_features is for precomputed features; the conv encoder has none, leave it out"
+        )
+    if config.pretrained and (config.encoder, config.observation) != ("mlp", "index"):
+        raise ConfigError(
+            "pretrained='autoencoder' reconstructs the scenes' features; give observation='index'"
+            " and encoder='mlp'"
+        )
+    if config.pretrained and (config.ideas.bottleneck or not config.shared_encoder):
+        raise ConfigError(
+            "pretrained='autoencoder' makes one code for states and goals, and no Gaussian; give"
+            " shared_encoder=True and model='gvf', 'usfa' or 'sfdp'"
         )
     if not config.embedding_layer:
         if config.ideas.bottleneck:

@@ -14,11 +14,13 @@ from vusfa.objectives.functional import (
 from vusfa.objectives.hindsight import HindsightLoss, expectile_loss, relabelled_target, walked_return
 from vusfa.objectives.optim import DualAscent, TFRMSprop
 from vusfa.objectives.returns import USFEstimator
+from vusfa.objectives.reward import RewardRegressionLoss, reward_regression_loss
 from vusfa.objectives.usf import USFLoss
 
 __all__ = [
     "DualAscent",
     "HindsightLoss",
+    "RewardRegressionLoss",
     "TFRMSprop",
     "USFEstimator",
     "USFLoss",
@@ -31,6 +33,7 @@ __all__ = [
     "n_step_return",
     "policy_gradient_loss",
     "relabelled_target",
+    "reward_regression_loss",
     "successor_loss",
     "successor_return",
     "walked_return",

@@ -10,14 +10,14 @@ from typing import Any
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.nn import TensorDictModuleBase
+from tensordict.nn import TensorDictModuleBase, TensorDictSequential
 from torch import Tensor
 from torchrl.collectors import BaseCollector
 
 from vusfa.envs import SceneObservation, resolve_goals
 from vusfa.errors import ConfigError
-from vusfa.modules import ActingPolicy, Agent, frozen, make_agent
-from vusfa.objectives import DualAscent
+from vusfa.modules import ActingPolicy, Agent, frozen, make_agent, pretrain_autoencoder
+from vusfa.objectives import DualAscent, RewardRegressionLoss
 from vusfa.objectives.hindsight import HindsightLoss
 from vusfa.scenes import SceneSet
 from vusfa.training.collectors import check_goals_dealt, make_collector, make_env
@@ -25,7 +25,14 @@ from vusfa.training.learning import annealed, descend, make_loss, make_optimiser
 from vusfa.training.replay import HindsightReplay
 from vusfa.training.session import Session, make_observation, scene_sources, torch_device
 
-__all__ = ["Hindsight", "Training", "make_hindsight", "make_training", "row_name"]
+__all__ = [
+    "Hindsight",
+    "Training",
+    "make_hindsight",
+    "make_reward_regression",
+    "make_training",
+    "row_name",
+]
 
 
 @dataclass
@@ -55,6 +62,8 @@ class Training:
         precision: context to compute in.
         multiplier: of the bottleneck's constraint, if there is one.
         hindsight: if the agent learns so, too.
+        reward: regression of the reward, if reward weights learn by it.
+        reconstructed: share of the features' variance that a pretrained encoder explains.
         settings: plain.
     """
 
@@ -66,6 +75,8 @@ class Training:
     multiplier: DualAscent | None
     hindsight: Hindsight | None
     settings: Mapping[str, Any]
+    reward: RewardRegressionLoss | None = None
+    reconstructed: float | None = None
 
     def collect(self, batches: Iterator[TensorDictBase]) -> TensorDictBase:
         """The collector's next batch, on its own."""
@@ -90,6 +101,8 @@ class Training:
                 batch = next(batches)
             with self.precision():  # another one: autocast keeps weights that it converted without gradients
                 terms = session.loss(batch)
+                if self.reward is not None:
+                    terms.update(self.reward(batch))
             total = total_loss(session.loss, terms)
             if self.hindsight is not None:
                 self.hindsight.replay.extend(batch)
@@ -134,12 +147,15 @@ def make_training(
     given = {key: value for key, value in settings["agent"].items() if value is not None}
     agent = make_agent(scenes=scenes, **given).to(device)
     actor, critic = agent.get_policy_operator(out_keys=["action"]), agent.get_value_operator()
-    loss, _, multiplier = make_loss(
-        actor, critic, entropy_coeff=settings["entropy"]["start"], **settings["objective"]
-    )
+    objective = {key: value for key, value in settings["objective"].items() if key != "reward_coeff"}
+    loss, _, multiplier = make_loss(actor, critic, entropy_coeff=settings["entropy"]["start"], **objective)
+    reward = make_reward_regression(critic, settings["objective"].get("reward_coeff", 0.0))
     optimiser = make_optimiser(
         agent.parameters(), optim["kind"], optim["lr"], optim["max_grad_norm"], **optim["options"]
     )
+    reconstructed = None
+    if agent.config["pretrained"] and not settings["resume"]:
+        reconstructed = pretrain_autoencoder(agent, seed=settings["seed"])
     saved = {"config": settings, "overrides": overrides, "sources": scene_sources(settings["scenes"])}
     hindsight = make_hindsight(settings, agent, scenes)
     session = Session(scenes, goals, agent, loss.to(device), optimiser, saved)
@@ -157,19 +173,54 @@ def make_training(
         **settings["collector"],
     )
     precision = partial(torch.autocast, device.type, torch.bfloat16, enabled=settings["autocast"])
-    return Training(session, actor, observation, collector, precision, multiplier, hindsight, settings)
+    return Training(
+        session,
+        actor,
+        observation,
+        collector,
+        precision,
+        multiplier,
+        hindsight,
+        settings,
+        reward,
+        reconstructed,
+    )
 
 
 def row_name(settings: Mapping[str, Any]) -> str:
-    """What a trained agent is called in tables: its model, and whether it learned with hindsight.
+    """What a trained agent is called in tables: its model, what it reads or remembers that is not the
+    default, and whether it learned with hindsight.
 
     >>> row_name({"agent": {"model": "vusfa"}, "hindsight": {"updates": 10}})
     'vusfa + hindsight'
+    >>> row_name({"agent": {"model": "vusfa", "memory": "lstm"}})
+    'vusfa, LSTM'
     >>> row_name({"agent": {"model": "gvf"}})  # from before there was hindsight
     'gvf'
     """
-    updates = settings.get("hindsight", {}).get("updates", 0)
-    return f"{settings['agent']['model']} + hindsight" if updates else settings["agent"]["model"]
+    agent, updates = settings["agent"], settings.get("hindsight", {}).get("updates", 0)
+    learns_pictures = agent.get("encoder") == "conv" or agent.get("observation") == "pixels"
+    told = {
+        "LSTM": agent.get("memory") == "lstm",
+        "pixels": learns_pictures,
+        "autoencoder": agent.get("pretrained") == "autoencoder",
+    }
+    name = ", ".join([agent["model"], *(words for words, true in told.items() if true)])
+    return f"{name} + hindsight" if updates else name
+
+
+def make_reward_regression(critic: TensorDictSequential, coeff: float) -> RewardRegressionLoss | None:
+    """What ``objective.reward_coeff`` asks for; None for 0.
+
+    Raises:
+        ConfigError: the model has no reward weights.
+    """
+    if not coeff:
+        return None
+    try:
+        return RewardRegressionLoss(critic, coeff)
+    except ValueError as error:
+        raise ConfigError(f"objective.reward_coeff is {coeff}: {error}; or give 0") from error
 
 
 def make_hindsight(settings: Mapping[str, Any], agent: Agent, scenes: SceneSet) -> Hindsight | None:

@@ -1,0 +1,88 @@
+"""phi of a pretrained autoencoder: it suffices to say what was seen, whatever is rewarded."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from vusfa.errors import ConfigError
+from vusfa.modules.agents import Agent
+
+__all__ = ["explained_features", "pretrain_autoencoder"]
+
+
+def explained_features(made: Tensor, features: Tensor) -> float:
+    """Share of the features' variance over states that a reconstruction explains; 1 where it is perfect, 0
+    where the mean would do as well.
+
+    Args:
+        made, features: (S, F).
+
+    >>> explained_features(torch.tensor([[0.0], [2.0], [4.0]]), torch.tensor([[0.0], [2.0], [6.0]]))
+    0.7857142686843872
+    """
+    left = (made - features).square().sum()
+    return (1 - left / (features - features.mean(0)).square().sum()).item()
+
+
+def pretrain_autoencoder(
+    agent: Agent, *, steps: int = 2000, batch_size: int = 256, lr: float = 1e-3, seed: int = 0
+) -> float:
+    r"""Train an agent's encoder, with a linear decoder that is then thrown away, to say what it saw.
+
+    .. math:: \min_{\phi, W} \; E_s \lVert W \phi(s) - x(s) \rVert^2
+
+    over all states of the agent's scenes, x(s) the features of the frame (normalised, where the agent
+    normalises them) and phi(s) the ``state_embedding`` of a history that holds it alone. The encoder's
+    weights are constants afterwards, as in every agent with ``pretrained="autoencoder"``.
+
+    Args:
+        agent: its encoder is changed.
+        steps: of Adam, with a learning rate that falls linearly to 0.
+        batch_size: states a step.
+        lr: learning rate at the start.
+        seed: of batches and decoder.
+
+    Returns:
+        the share of the features' variance that the reconstruction explains, see :func:`explained_features`.
+
+    Raises:
+        ConfigError: the agent was not made with ``pretrained="autoencoder"``.
+
+    >>> from vusfa.modules import make_agent
+    >>> from vusfa.scenes import SceneSet
+    >>> rooms = SceneSet.bundled(["bathroom"])
+    >>> agent = make_agent("usfa", scenes=rooms, history=1, hidden_size=32, pretrained="autoencoder")
+    >>> before = pretrain_autoencoder(agent, steps=0)
+    >>> before < 0.1 < pretrain_autoencoder(agent, steps=50)
+    True
+    """
+    if agent.config["pretrained"] != "autoencoder":
+        raise ConfigError("only an agent made with pretrained='autoencoder' has its encoder pretrained")
+    encoder = agent.encoder
+    frames = next(module for module in encoder.modules() if hasattr(module, "lookup"))
+    features: Tensor = frames.lookup(None)  # type: ignore[operator]
+    generator = torch.Generator().manual_seed(seed)
+    decoder = nn.Linear(agent.config["embedding_size"], features.shape[-1]).to(features.device)
+    with torch.no_grad():
+        decoder.weight.copy_(torch.randn(decoder.weight.shape, generator=generator) * 0.01)
+        decoder.bias.zero_()
+
+    def made(states: Tensor) -> Tensor:
+        return decoder(encoder(states.unsqueeze(-1).expand(-1, agent.config["history"]), states)[0])
+
+    encoder.requires_grad_(True)
+    try:
+        optimiser = torch.optim.Adam([*encoder.parameters(), *decoder.parameters()], lr=lr)
+        for step in range(steps):
+            for group in optimiser.param_groups:
+                group["lr"] = lr * (1 - step / steps)
+            states = torch.randint(len(features), (batch_size,), generator=generator).to(features.device)
+            optimiser.zero_grad()
+            functional.mse_loss(made(states), features[states]).backward()
+            optimiser.step()
+    finally:
+        encoder.requires_grad_(False)
+    with torch.no_grad():
+        return explained_features(made(torch.arange(len(features), device=features.device)), features)
