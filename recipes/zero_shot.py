@@ -19,7 +19,8 @@ from vusfa.errors import VusfaError
 from vusfa.evaluation import compare, print_summary
 from vusfa.evaluation.files import check_folder
 from vusfa.evaluation.manifest import BUNDLED_MANIFEST, read_manifest
-from vusfa.evaluation.tabulated import TabulatedPolicy, sees_one_frame
+from vusfa.evaluation.tabulated import TabulatedPolicy
+from vusfa.modules import sees_one_frame
 from vusfa.training import (
     EvaluationProgress,
     load_agent,

@@ -14,6 +14,7 @@ from vusfa.modules.bottleneck import GaussianEncoder, LatentSampler
 from vusfa.modules.episodic import TriedActions
 from vusfa.modules.frames import FeatureFrames, PictureFrames
 from vusfa.modules.linear import HistoryLinear, SceneLinear
+from vusfa.modules.pairs import StateGoalPairs, sees_one_frame
 from vusfa.modules.policy import PolicyHead, SuccessorPolicyHead
 from vusfa.modules.presets import MODELS, PRESETS, AgentConfig, resolve_config
 from vusfa.modules.siamese import NormalisedEncoder, SiameseEncoder, frozen
@@ -38,6 +39,7 @@ __all__ = [
     "SceneLayer",
     "SceneLinear",
     "SiameseEncoder",
+    "StateGoalPairs",
     "SuccessorHead",
     "SuccessorPolicyHead",
     "SuccessorValue",
@@ -50,5 +52,6 @@ __all__ = [
     "make_agent",
     "pretrain_autoencoder",
     "resolve_config",
+    "sees_one_frame",
     "transplant",
 ]

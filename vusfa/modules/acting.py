@@ -8,6 +8,8 @@ stretch of them, and nothing but the action is written.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
 import torch
@@ -22,6 +24,7 @@ from vusfa.modules.trunk import SiameseTrunk
 
 if TYPE_CHECKING:
     from vusfa.modules.agents import Agent
+    from vusfa.modules.pairs import StateGoalPairs
 
 __all__ = ["ActingPolicy", "action_logits", "draw_actions"]
 
@@ -109,6 +112,24 @@ class ActingPolicy(TensorDictModuleBase):
         ]
         self.out_keys = ["action"]
         self._num_scenes = agent.scene_layer.linear.num_scenes  # that have weights of their own
+        self._table: tuple[StateGoalPairs, Tensor] | None = None
+
+    @contextmanager
+    def tabulated(self, pairs: StateGoalPairs) -> Iterator[None]:
+        """Within it, actions are drawn from chances that are written down on the way in. The weights must not
+        change meanwhile, and no goal be asked for that ``pairs`` does not have.
+
+        Args:
+            pairs: of the agent's world.
+
+        Raises:
+            ValueError: the agent sees more than one frame, or something else than ids.
+        """
+        self._table = pairs, pairs.logits(self.agent)
+        try:
+            yield
+        finally:
+            self._table = None
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Adds ``action``, (\\*B,) int64."""
@@ -124,6 +145,9 @@ class ActingPolicy(TensorDictModuleBase):
         )
 
     def _logits(self, state: Tensor, goal: Tensor, scene: Tensor) -> Tensor:
+        if self._table is not None:
+            pairs, table = self._table
+            return table[pairs.rows(state[:, -1], goal)]
         if self._num_scenes == 1 or scene.is_cuda:  # there counting means waiting for the device
             return action_logits(self.agent, state, goal, scene)
         scene, order = scene.sort(stable=True)

@@ -13,8 +13,8 @@ from vusfa.evaluation.exact import exact_goals
 from vusfa.evaluation.manifest import BUNDLED_MANIFEST, Manifest, make_manifest, read_manifest
 from vusfa.evaluation.metrics import spl
 from vusfa.evaluation.results import Cell
-from vusfa.evaluation.tabulated import TabulatedPolicy, sees_one_frame
-from vusfa.modules import Agent
+from vusfa.evaluation.tabulated import TabulatedPolicy
+from vusfa.modules import Agent, sees_one_frame
 from vusfa.scenes import SceneSet
 from vusfa.training.facts import run_facts
 from vusfa.training.progress import EvaluationProgress

@@ -16,7 +16,15 @@ from torchrl.collectors import BaseCollector
 
 from vusfa.envs import SceneObservation, resolve_goals
 from vusfa.errors import ConfigError
-from vusfa.modules import ActingPolicy, Agent, frozen, make_agent, pretrain_autoencoder
+from vusfa.modules import (
+    ActingPolicy,
+    Agent,
+    StateGoalPairs,
+    frozen,
+    make_agent,
+    pretrain_autoencoder,
+    sees_one_frame,
+)
 from vusfa.objectives import DualAscent, RewardRegressionLoss
 from vusfa.objectives.hindsight import HindsightLoss
 from vusfa.scenes import SceneSet
@@ -29,10 +37,14 @@ __all__ = [
     "Hindsight",
     "Training",
     "make_hindsight",
+    "make_pairs",
     "make_reward_regression",
     "make_training",
     "row_name",
 ]
+
+#: Pairs of state and goal for each frame of a batch, up to which an agent's answers are written down.
+PAIRS_A_FRAME = 3
 
 
 @dataclass
@@ -63,6 +75,8 @@ class Training:
         multiplier: of the bottleneck's constraint, if there is one.
         hindsight: if the agent learns so, too.
         reward: regression of the reward, if reward weights learn by it.
+        acting: what walks for the actor, where that has no memory.
+        pairs: all that the collector may ask it, where that is written down before each batch.
         reconstructed: share of the features' variance that a pretrained encoder explains.
         settings: plain.
     """
@@ -76,11 +90,19 @@ class Training:
     hindsight: Hindsight | None
     settings: Mapping[str, Any]
     reward: RewardRegressionLoss | None = None
+    acting: ActingPolicy | None = None
+    pairs: StateGoalPairs | None = None
     reconstructed: float | None = None
 
     def collect(self, batches: Iterator[TensorDictBase]) -> TensorDictBase:
         """The collector's next batch, on its own."""
-        with self.session.encoded_once(self.precision), self.precision():
+        with self.session.encoded_once(self.precision):
+            return self._next(batches)
+
+    def _next(self, batches: Iterator[TensorDictBase]) -> TensorDictBase:
+        with self.precision(), ExitStack() as stack:
+            if self.acting is not None and self.pairs is not None:
+                stack.enter_context(self.acting.tabulated(self.pairs))
             return next(batches)
 
     def update(self, batches: Iterator[TensorDictBase]) -> tuple[TensorDictBase, dict[str, Tensor]]:
@@ -97,8 +119,7 @@ class Training:
         session.loss.entropy_coeff = annealed(session.frames, **self.settings["entropy"])
         later: dict[str, Tensor] = {}
         with session.encoded_once(self.precision):
-            with self.precision():
-                batch = next(batches)
+            batch = self._next(batches)
             with self.precision():  # another one: autocast keeps weights that it converted without gradients
                 terms = session.loss(batch)
                 if self.reward is not None:
@@ -164,10 +185,11 @@ def make_training(
     observation = make_observation(agent, scenes, task.pop("crop"))
     transforms = [*([observation] if observation is not None else []), *agent.make_env_transforms()]
     env = partial(make_env, scenes, transforms, history=agent.config["history"], device=device, **task)
+    acting = None if agent.memory is not None else ActingPolicy(agent)
     collector = partial(
         make_collector,
         make_env=env,
-        policy=actor if agent.memory is not None else ActingPolicy(agent),
+        policy=actor if acting is None else acting,
         seed=settings["seed"],
         autocast=settings["autocast"],
         **settings["collector"],
@@ -183,6 +205,8 @@ def make_training(
         hindsight,
         settings,
         reward,
+        acting,
+        make_pairs(settings, agent, scenes, goals),
         reconstructed,
     )
 
@@ -207,6 +231,23 @@ def row_name(settings: Mapping[str, Any]) -> str:
     }
     name = ", ".join([agent["model"], *(words for words, true in told.items() if true)])
     return f"{name} + hindsight" if updates else name
+
+
+def make_pairs(
+    settings: Mapping[str, Any], agent: Agent, scenes: SceneSet, goals: torch.Tensor
+) -> StateGoalPairs | None:
+    """What a collector may ask, where writing all answers down before each batch is the shorter way: for an
+    agent of one frame in one process, and no more than :data:`PAIRS_A_FRAME` pairs for each frame of a batch.
+    None elsewhere.
+
+    A pair in a product of thousands costs a fraction of what it costs in a step's product of 64.
+    """
+    collector = settings["collector"]
+    if not sees_one_frame(agent) or collector["kind"] != "single" or settings["hindsight"]["updates"]:
+        return None
+    pairs = StateGoalPairs(scenes, goals)
+    frames = collector["num_envs"] * collector["rollout"]
+    return pairs if len(pairs) <= PAIRS_A_FRAME * frames else None
 
 
 def make_reward_regression(critic: TensorDictSequential, coeff: float) -> RewardRegressionLoss | None:
