@@ -111,3 +111,30 @@ def test_an_autoencoders_phi_and_regressed_rewards(scene_file: Path):
 def test_regression_of_the_reward_needs_reward_weights(scene_file: Path):
     with pytest.raises(ConfigError, match=r"objective\.reward_coeff is 0\.5.*reward_weights"):
         made(scene_file, "agent.model=gvf", "objective.reward_coeff=0.5")
+
+
+@pytest.mark.parametrize(
+    ("overrides", "tabulated"),
+    [
+        (["collector.rollout=100"], True),
+        (["collector.rollout=1"], False),  # more pairs than three a frame
+        (["collector.rollout=100", "agent.history=4"], False),
+        (["collector.rollout=100", *HINDSIGHT], False),
+    ],
+)
+def test_where_answers_are_written_down(scene_file: Path, overrides: list[str], tabulated: bool):
+    assert (made(scene_file, *overrides).pairs is not None) == tabulated
+
+
+def test_written_down_or_not_the_same_is_learned(scene_file: Path):
+    weights = []
+    for pairs in (True, False):
+        training = made(scene_file, "autocast=false", "collector.rollout=100")
+        if not pairs:
+            training.pairs = None
+        with training.session.collecting(training.make_collector) as batches:
+            for _ in range(3):
+                batch, terms = training.update(batches)
+                training.session.count(batch, terms, 1.0)
+        weights.append(training.session.agent.state_dict())
+    torch.testing.assert_close(*weights, rtol=1e-4, atol=1e-5)

@@ -29,6 +29,7 @@ class TabulatedPolicy(TensorDictModuleBase):
     Raises:
         ValueError: the agent sees more than one frame, or something else than ids.
 
+    >>> import torch
     >>> from tensordict import TensorDict
     >>> from vusfa.modules import make_agent
     >>> rooms = SceneSet.bundled(["bathroom"])

@@ -1,0 +1,83 @@
+"""Pairs of state and goal: their numbers, and an agent's answers to all of them."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+
+from vusfa.modules import ActingPolicy, StateGoalPairs, make_agent
+from vusfa.scenes import SceneSet
+
+SIZES = {"hidden_size": 16, "embedding_size": 8, "history": 1}
+
+
+@pytest.fixture(scope="module")
+def rooms() -> SceneSet:
+    return SceneSet.bundled(["bathroom", "bedroom"])
+
+
+def test_every_pair_of_one_scene_once_and_no_other(rooms: SceneSet) -> None:
+    goals = torch.tensor([500, 3, 175, 176, 3])
+    pairs = StateGoalPairs(rooms, goals)
+    found = list(zip(pairs.state.tolist(), pairs.goal.tolist(), pairs.scene.tolist(), strict=True))
+    sizes = [scene.num_states for scene in rooms.scenes]
+    wanted = {(state, goal, 0) for goal in (3, 175) for state in range(sizes[0])}
+    wanted |= {(state, goal, 1) for goal in (176, 500) for state in range(sizes[0], sum(sizes))}
+    assert len(found) == len(pairs) == len(wanted)
+    assert set(found) == wanted
+    assert torch.equal(pairs.rows(pairs.state, pairs.goal), torch.arange(len(pairs)))
+
+
+def test_a_state_that_is_no_goal_is_not_mistaken_for_one(rooms: SceneSet) -> None:
+    pairs = StateGoalPairs(rooms, torch.tensor([3]))
+    with pytest.raises(IndexError):
+        torch.zeros(len(pairs))[pairs.rows(torch.tensor([7]), torch.tensor([4]))]
+
+
+@pytest.mark.parametrize("model", ["gvf", "vusfa"])
+def test_answers_are_the_actors(rooms: SceneSet, model: str) -> None:
+    torch.manual_seed(0)
+    agent = make_agent(model, scenes=rooms, **SIZES)
+    pairs = StateGoalPairs(rooms, torch.tensor([3, 200, 480]))
+    inputs = TensorDict(
+        {"state_id": pairs.state.unsqueeze(-1), "goal_id": pairs.goal, "scene_id": pairs.scene}, [len(pairs)]
+    )
+    wanted = agent.get_policy_operator().get_dist(inputs).logits
+    found = pairs.logits(agent, at_once=100).log_softmax(-1)
+    torch.testing.assert_close(found, wanted)
+
+
+def test_a_tabulated_walker_acts_as_before_and_forgets_its_table(rooms: SceneSet) -> None:
+    torch.manual_seed(0)
+    agent = make_agent("vusfa", scenes=rooms, **SIZES)
+    policy, pairs = ActingPolicy(agent), StateGoalPairs(rooms, torch.tensor([3, 200]))
+    goal = torch.tensor([3, 200, 200, 3, 3])
+    rows = {"state_id": torch.tensor([[0], [300], [176], [175], [3]]), "goal_id": goal}
+    rows["scene_id"] = (goal > 100).long()
+
+    def actions() -> list[int]:
+        torch.manual_seed(5)
+        with torch.no_grad():
+            drawn = policy(TensorDict(rows, [5]))["action"]
+            with set_exploration_type(ExplorationType.DETERMINISTIC):
+                return [*drawn.tolist(), *policy(TensorDict(rows, [5]))["action"].tolist()]
+
+    before = actions()
+    with policy.tabulated(pairs):
+        assert actions() == before
+        with torch.no_grad():
+            for param in agent.parameters():
+                param.neg_()
+        assert actions() == before  # within, the table is what acts
+    assert actions() != before
+
+
+def test_an_agent_that_sees_more_has_no_table(rooms: SceneSet) -> None:
+    agent = make_agent("gvf", scenes=rooms, hidden_size=8, embedding_size=8)
+    with (
+        pytest.raises(ValueError, match="history=4"),
+        ActingPolicy(agent).tabulated(StateGoalPairs(rooms, torch.tensor([3]))),
+    ):
+        pass
