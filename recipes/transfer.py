@@ -12,15 +12,17 @@ import sys
 import time
 from pathlib import Path
 
+import torch
 import tyro
 from rich.console import Console
 from rich.progress import track
 
 from vusfa.errors import CheckpointError, VusfaError
 from vusfa.evaluation.results import Cell, read_cell, read_cells, write_cell
-from vusfa.evaluation.transfer import KINDS, new_goals
+from vusfa.evaluation.transfer import KINDS, new_goals, walked_lengths
 from vusfa.evaluation.transfer_figure import draw_transfer, transfer_table
 from vusfa.modules.presets import MODELS
+from vusfa.scenes import SceneSet
 from vusfa.training import load_agent, run_facts, set_threads
 from vusfa.training.transfer import fine_tune, fine_tuning_settings
 
@@ -91,7 +93,8 @@ def show(
     *,
     results: Path = Path("results"),
     experiment: str = "transfer",
-    threshold: float = 50.0,
+    threshold: float = 250.0,
+    scenes: list[str] | None = None,
     out: Path = Path("transfer.png"),
 ) -> None:
     """Print the table, and draw the figure.
@@ -99,14 +102,19 @@ def show(
     Args:
         results: folder of results.
         experiment: whose cells.
-        threshold: actions an episode; the table tells after how many frames the mean comes down to it.
+        threshold: actions an episode; the table tells after how many frames the mean comes down to it. Half
+            of those that are allowed when not given.
+        scenes: bundled names and files, in order; the bundled rooms that the cells name when not given.
         out: the picture.
     """
     cells = read_cells(results, experiment)
     if not cells:
         raise VusfaError(f"{results / experiment}: no results; run recipes/transfer.py run first")
-    print(transfer_table(cells, threshold))
-    print(draw_transfer(cells, out))
+    world = SceneSet.open(scenes or cells[0].info["scenes"])
+    sets = {cell.info["kind"]: [entry["goals"] for entry in cell.info["curves"]] for cell in cells}
+    bounds = {kind: [walked_lengths(world, torch.tensor(g)) for g in goals] for kind, goals in sets.items()}
+    print(transfer_table(cells, threshold, bounds))
+    print(draw_transfer(cells, out, bounds))
 
 
 if __name__ == "__main__":

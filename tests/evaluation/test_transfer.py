@@ -10,7 +10,7 @@ import torch
 from vusfa.envs import resolve_goals
 from vusfa.errors import GoalError
 from vusfa.evaluation.results import Cell
-from vusfa.evaluation.transfer import KINDS, area_under, frames_to, new_goals
+from vusfa.evaluation.transfer import KINDS, area_under, frames_to, new_goals, walked_lengths
 from vusfa.evaluation.transfer_figure import draw_transfer, mean_over, transfer_table
 from vusfa.scenes import Scene, SceneSet
 
@@ -97,3 +97,29 @@ def test_the_picture(tmp_path: Path) -> None:
     )
     assert path.read_bytes()[:8] == b"\x89PNG\r\n\x1a\n"
     assert [entry.name for entry in tmp_path.iterdir()] == ["a.png"]
+
+
+def test_walked_lengths_against_episodes_that_are_walked(make_scene: Callable[..., Scene]) -> None:
+    rooms, goals = SceneSet([make_scene("hall"), make_scene("attic", 3, 1)]), torch.tensor([2, 17, 20])
+    generator, lengths, paths = torch.Generator().manual_seed(0), [], []
+    for goal in goals.tolist():
+        states = (rooms.scene_id == rooms.scene_id[goal]).nonzero().squeeze(-1)
+        starts = states[states != goal].repeat(300)
+        here, steps = starts.clone(), torch.zeros(len(starts))
+        for _ in range(40):
+            away = here != goal
+            steps += away
+            actions = torch.randint(rooms.num_actions, here.shape, generator=generator)
+            here = torch.where(away, rooms.successor[here, actions], here)
+        lengths.append(steps.mean().item())
+        paths.append(sum(int(rooms.distance(s, goal)) for s in states[states != goal]) / (len(states) - 1))
+    walk, shortest = walked_lengths(rooms, goals, max_steps=40)
+    assert walk == pytest.approx(sum(lengths) / 3, rel=0.03)
+    assert shortest == pytest.approx(sum(paths) / 3)
+
+
+def test_floor_and_ceiling_stand_below_the_models() -> None:
+    made = [cell("gvf", 0, [[8.0, 6.0, 4.0]]), cell("gvf", 1, [[8.0, 6.0, 4.0]])]
+    lines = transfer_table(made, 5.0, {"1-step": [(300.0, 10.0), (320.0, 14.0)]}).splitlines()
+    assert lines[-2].startswith("| 1-step | random walk | – | – | 310.0 [")
+    assert lines[-1].startswith("| 1-step | shortest path | – | – | 12.0 [")

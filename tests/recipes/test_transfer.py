@@ -26,6 +26,7 @@ def test_run_and_show(
     recipe: Callable[[str], Any],
     folders: dict[str, Path],
     tmp_path: Path,
+    scene_file: Path,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     transfer = recipe("transfer")
@@ -39,7 +40,7 @@ def test_run_and_show(
     capsys.readouterr()
     transfer.run(**asked, **folders)
     assert "already there" in capsys.readouterr().out
-    transfer.show(results=folders["results"], out=tmp_path / "transfer.png")
+    transfer.show(results=folders["results"], out=tmp_path / "transfer.png", scenes=[str(scene_file)])
     printed = capsys.readouterr().out
     assert "| random | gvf | trained on | 1 |" in printed
     assert (tmp_path / "transfer.png").exists()

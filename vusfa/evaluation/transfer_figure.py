@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import torch
@@ -16,6 +16,7 @@ from vusfa.evaluation.transfer import KINDS, area_under, frames_to
 __all__ = ["draw_transfer", "mean_over", "transfer_table"]
 
 WAYS = ("trained on", "from scratch")
+BOUNDS = ("random walk", "shortest path")
 _COLOURS = {"gvf": "#0072b2", "usfa": "#e69f00", "sfdp": "#009e73", "vusfa": "#cc79a7"}
 
 
@@ -34,20 +35,26 @@ def mean_over(values: Sequence[Sequence[float]]) -> Estimate:
     return bootstrap_mean(sums, torch.zeros(numbers.shape[1], dtype=torch.int64))
 
 
-def transfer_table(cells: Sequence[Cell], threshold: float) -> str:
+def transfer_table(
+    cells: Sequence[Cell], threshold: float, bounds: Mapping[str, Sequence[tuple[float, float]]] | None = None
+) -> str:
     """Markdown: for each kind, model and way the mean length over the training, at its start and end, and the
     frames to a threshold, each with its 95 % interval over seeds and sets of goals.
 
     Args:
         cells: of the experiment.
         threshold: actions an episode.
+        bounds: of each kind, for each set of goals the length of a random walk and of the shortest path, see
+            :func:`~vusfa.evaluation.transfer.walked_lengths`; a row each below the models.
     """
+    bounds, kinds = bounds or {}, []
     lines = [
         "| new goals | model | | seeds | length, mean of the curve | at first | at last |"
         f" frames to {threshold:g} | came there |",
         "|---|---|---|---|---|---|---|---|---|",
     ]
     for kind, model, here in _groups(cells):
+        kinds += [] if kind in kinds else [kind]
         for way in WAYS:
             curves = [[entry[way] for entry in cell.info["curves"]] for cell in here]
             area = mean_over([[area_under(c["frames"], c["length"]) for c in row] for row in curves])
@@ -60,11 +67,20 @@ def transfer_table(cells: Sequence[Cell], threshold: float) -> str:
                 f"| {kind} | {model} | {way} | {len(here)} | {_number(area)} | {_number(first)} |"
                 f" {_number(last)} | {reached} | {arrived} of {total} |"
             )
+    for kind in kinds:
+        for index, name in enumerate(BOUNDS if kind in bounds else ()):
+            length = _number(mean_over([[pair[index] for pair in bounds[kind]]]))
+            lines.append(f"| {kind} | {name} | – | – | {length} | – | – | – | – |")
     return "\n".join(lines)
 
 
-def draw_transfer(cells: Sequence[Cell], path: str | Path) -> Path:
-    """Episode length against frames, a panel a kind of goals, with 95 % bands; as PNG, atomically."""
+def draw_transfer(
+    cells: Sequence[Cell],
+    path: str | Path,
+    bounds: Mapping[str, Sequence[tuple[float, float]]] | None = None,
+) -> Path:
+    """Episode length against frames, a panel a kind of goals, with 95 % bands, the random walk and the
+    shortest path in grey (``bounds``, see :func:`transfer_table`); as PNG, atomically."""
     from matplotlib.figure import Figure  # of the extra "recipes"
 
     kinds = [kind for kind in KINDS if any(cell.info["kind"] == kind for cell in cells)]
@@ -87,6 +103,10 @@ def draw_transfer(cells: Sequence[Cell], path: str | Path) -> Path:
             )
         panel.set_title(f"new goals: {kind}")
         panel.set_xlabel("thousand frames")
+    for kind, panel in zip(kinds, panels, strict=True):
+        for index, style in enumerate(("--", "-.") if kind in (bounds or {}) else ()):
+            height = mean_over([[pair[index] for pair in (bounds or {})[kind]]]).value
+            panel.axhline(height, linestyle=style, color="#777777", lw=1, label=BOUNDS[index])
     panels[0].set_ylabel("actions an episode")
     panels[-1].legend(frameon=False, fontsize=8)
     with replacing(path) as unfinished:
