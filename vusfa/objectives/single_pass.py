@@ -18,10 +18,12 @@ from tensordict.nn import (
     TensorDictSequential,
 )
 from tensordict.utils import NestedKey
-from torch import nn
+from torch import Tensor, nn
 from torch.distributions import Distribution
 
-__all__ = ["Memory", "flatten", "run_actor", "run_critic", "select_inputs"]
+from vusfa.objectives.distinct import spread
+
+__all__ = ["Memory", "ends_in_distribution", "flatten", "run_actor", "run_critic", "select_inputs"]
 
 
 class Memory:
@@ -102,23 +104,36 @@ def flatten(module: nn.Module) -> list[TensorDictModuleBase]:
     return [leaf for child in children for leaf in flatten(child)]
 
 
-def run_actor(actor: nn.Module, tensordict: TensorDictBase, memory: Memory) -> Distribution:
+def run_actor(
+    actor: nn.Module, tensordict: TensorDictBase, memory: Memory, index: Tensor | None = None
+) -> Distribution:
     """The action's distribution, from a tensordict holding the actor's inputs.
 
     Args:
         actor: has ``get_dist``, as TorchRL's ``ProbabilisticActor`` and every probabilistic sequence.
         tensordict: any batch shape; intermediate results are written into it.
         memory: of this forward pass.
+        index: (\\*B,), rows of the tensordict to take, see :func:`~vusfa.objectives.distinct.distinct_rows`;
+            for actors of which :func:`ends_in_distribution` is true.
 
     Returns:
-        the distribution, with the tensordict's batch shape.
+        the distribution, with the tensordict's batch shape, or the index's.
     """
     modules = _actor_modules(actor)
     if not modules:
         return actor.get_dist(tensordict)  # type: ignore[operator]
     for module in modules:
         tensordict = memory.call(module, tensordict)
-    return _last(actor).get_dist(tensordict)
+    last = _last(actor)
+    if index is not None:
+        rows = {key: spread(tensordict.get(key), index) for key in last.in_keys}
+        tensordict = TensorDict(rows, index.shape)
+    return last.get_dist(tensordict)
+
+
+def ends_in_distribution(actor: nn.Module) -> bool:
+    """Whether an actor is modules one after the other and one distribution at their end."""
+    return bool(_actor_modules(actor))
 
 
 def run_critic(critic: nn.Module, tensordict: TensorDictBase, memory: Memory) -> TensorDictBase:

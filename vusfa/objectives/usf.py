@@ -19,6 +19,7 @@ from torch.distributions import Distribution
 from torchrl.objectives.common import LossModule
 from torchrl.objectives.utils import ValueEstimators, distance_loss
 
+from vusfa.objectives.distinct import distinct_rows, spread
 from vusfa.objectives.distribution import action_entropy, action_log_prob
 from vusfa.objectives.functional import (
     explained_variance,
@@ -29,7 +30,7 @@ from vusfa.objectives.functional import (
 )
 from vusfa.objectives.keys import LossKeys
 from vusfa.objectives.returns import USFEstimator
-from vusfa.objectives.single_pass import Memory, run_actor, run_critic, select_inputs
+from vusfa.objectives.single_pass import Memory, ends_in_distribution, run_actor, run_critic, select_inputs
 
 __all__ = ["USFLoss"]
 
@@ -44,10 +45,14 @@ COEFFICIENTS = ("objective_coeff", "critic_coeff", "successor_coeff", "entropy_c
 
 
 class Results(NamedTuple):
-    """What one pass through both networks gave."""
+    """What one pass through both networks gave.
+
+    ``latent_size`` is the number of features of the latent whose divergence ``written`` tells without it.
+    """
 
     distribution: Distribution
     written: TensorDictBase
+    latent_size: int = 0
 
 
 class USFLoss(LossModule):
@@ -93,6 +98,9 @@ class USFLoss(LossModule):
         separate_losses: whether parameters that both networks hold are trained by the policy's loss alone.
             What only successor features and the bottleneck train must then not be shared. Needs
             ``functional=True``.
+        distinct: where the networks read ids alone, rows that read the same go through them once
+            (:func:`~vusfa.objectives.distinct.distinct_rows`). Equal rows then share the noise of a latent
+            that is sampled: the mean of the loss is the same. Without effect with ``separate_losses``.
 
     Each term is a method as well. It takes steps with their targets and returns their weighted terms;
     ``results`` are those of the networks on these steps, which it runs when there are none.
@@ -167,6 +175,7 @@ class USFLoss(LossModule):
         reduction: Literal["none", "mean", "sum"] | None = "mean",
         functional: bool = True,
         separate_losses: bool = False,
+        distinct: bool = False,
     ) -> None:
         reduction = reduction or "mean"
         _check_choice("bottleneck_on", bottleneck_on, ("both", "goal", "state"))
@@ -191,6 +200,7 @@ class USFLoss(LossModule):
             self.target_actor_network_params = None
             self.target_critic_network_params = None
         self.separate_losses = separate_losses
+        self.distinct = distinct and not separate_losses and ends_in_distribution(actor_network)
         self.bottleneck_on = bottleneck_on
         self.information_reduction = information_reduction
         self.loss_critic_type = loss_critic_type
@@ -351,8 +361,8 @@ class USFLoss(LossModule):
         self, tensordict: TensorDictBase, results: Results | None = None
     ) -> tuple[Tensor, Tensor]:
         """The information constraint's term, ``beta (KL - I_c)``, and KL, both ``(*batch,)``."""
-        written = (results or self._evaluate(tensordict)).written
-        kl = torch.stack([self._divergence(written, branch) for branch in self._branches()]).mean(0)
+        results = results or self._evaluate(tensordict)
+        kl = torch.stack([self._divergence(results, branch) for branch in self._branches()]).mean(0)
         # a copy: the multiplier may move before this graph is differentiated
         beta = self.bottleneck_coeff.detach().clone()
         return information_bottleneck(kl, beta, self.information_target), kl.detach()
@@ -398,15 +408,32 @@ class USFLoss(LossModule):
     def _evaluate(self, tensordict: TensorDictBase) -> Results:
         actor, critic = self.actor_network, self.critic_network
         inputs = select_inputs(tensordict, *actor.in_keys, *critic.in_keys)
-        memory = Memory()
+        memory, index = Memory(), None
+        found = distinct_rows(inputs) if self.distinct else None
+        if found is not None:
+            inputs, index = found
         with self._params_of("actor_network"):
-            distribution = run_actor(actor, inputs.select(*actor.in_keys, strict=False), memory)
+            distribution = run_actor(actor, inputs.select(*actor.in_keys, strict=False), memory, index)
         if self.separate_losses:
             # what both hold is a constant to the critic: its modules run again, on detached parameters
             memory = Memory()
         with self._params_of("critic_network"):
             written = run_critic(critic, inputs.select(*critic.in_keys, strict=False), memory)
+        if index is not None:
+            rows = {key: spread(written.get(key), index) for key in self._read() if key in written.keys(True)}
+            sizes = [written.get(loc).shape[-1] for loc, *_ in self._branches()]
+            return Results(distribution, TensorDict(rows, index.shape), sizes[0] if sizes else 0)
         return Results(distribution, written)
+
+    def _read(self) -> list[NestedKey]:
+        """What terms and targets read of what the critic writes."""
+        keys = self.tensor_keys
+        names: list[NestedKey] = [keys.value]
+        if self._writes(keys.successor_features, keys.state_embedding):
+            names += [keys.successor_features, keys.state_embedding]
+        for loc, scale, known in self._branches():
+            names += [known] if self._writes(known) else [loc, scale]
+        return list(dict.fromkeys(unravel_key(key) for key in names))
 
     def _params_of(self, name: str) -> contextlib.AbstractContextManager:
         if not self.functional:
@@ -427,10 +454,12 @@ class USFLoss(LossModule):
         chosen = branches if self.bottleneck_on == "both" else [self.bottleneck_on]
         return [branches[name] for name in chosen if self._writes(*branches[name][:2])]
 
-    def _divergence(self, written: TensorDictBase, branch: tuple[NestedKey, NestedKey, NestedKey]) -> Tensor:
+    def _divergence(self, results: Results, branch: tuple[NestedKey, NestedKey, NestedKey]) -> Tensor:
         """KL of one latent, ``(*batch,)``, its features reduced."""
-        loc, scale, known = branch
-        features = written.get(loc).shape[-1] if self.information_reduction == "mean" else 1
+        (loc, scale, known), written = branch, results.written
+        features = 1
+        if self.information_reduction == "mean":
+            features = results.latent_size or written.get(loc).shape[-1]
         if self._writes(known):
             return written.get(known).squeeze(-1) / features
         return gaussian_kl(written.get(loc), written.get(scale)).sum(-1) / features

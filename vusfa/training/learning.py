@@ -98,6 +98,7 @@ def make_loss(
             bottleneck_on=bottleneck_on,  # type: ignore[arg-type]
             information_reduction=information_reduction,  # type: ignore[arg-type]
             loss_critic_type=loss_critic_type,  # type: ignore[arg-type]
+            distinct=True,
         )
         loss.make_value_estimator(estimator)
         ascent = DualAscent(loss, bottleneck_step_size, bottleneck_maximum) if loss.has_bottleneck else None
