@@ -21,6 +21,7 @@ sys.path.insert(0, str(Path(__file__).parents[1]))  # a script's own folder is t
 from benchmarks.machine import describe_machine, foreign_load
 from benchmarks.report import Options, Report, write_reports
 from benchmarks.table import print_machine, print_report
+from vusfa.training.memory import keep_memory
 
 
 class Suite(StrEnum):
@@ -77,6 +78,7 @@ def main(
     options = Options(quick, repetitions, seconds, threads, cap, tuple(change or ()))
     if quick:
         options = replace(options, repetitions=1, seconds=0.0)
+    keep_memory()  # as recipes do; the peers have it, too
     console, machine = Console(), describe_machine()
     machine["foreign_load"] = round(foreign_load(), 2)
     print_machine(machine, console)

@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import torch
 from torch import Tensor
+from torch.nn.functional import mse_loss
 
 __all__ = [
     "dual_ascent",
@@ -75,18 +76,18 @@ def lambda_return(
     tensor([ 1., 12.])
     """
     _assert_transitions(cumulant, next_value, done, terminated, time_dim)
-    bootstrap = torch.where(terminated, 0.0, next_value)
-    cumulants, bootstraps, dones = (x.unbind(time_dim) for x in (cumulant, bootstrap, done))
+    columns = (x.unbind(time_dim) for x in (cumulant, next_value, done, terminated))
+    cumulants, next_values, dones, terminals = columns
     # the whole return, not mixed with estimates that may not even be finite
     whole = not isinstance(lmbda, Tensor) and lmbda == 1.0
-    value = bootstraps[-1]
+    value: Tensor | None = None
     returns = []
-    for cumulant_t, bootstrap_t, done_t in zip(
-        reversed(cumulants), reversed(bootstraps), reversed(dones), strict=True
-    ):
+    for time in reversed(range(len(cumulants))):
+        bootstrap = torch.where(terminals[time], 0.0, next_values[time])
+        value = bootstrap if value is None else value
         # where the episode ended, the return of the step after it belongs to another episode
-        value = torch.where(done_t, bootstrap_t, value if whole else bootstrap_t.lerp(value, lmbda))
-        value = cumulant_t + gamma * value
+        value = torch.where(dones[time], bootstrap, value if whole else bootstrap.lerp(value, lmbda))
+        value = cumulants[time] + gamma * value
         returns.append(value)
     return torch.stack(returns[::-1], time_dim)
 
@@ -207,7 +208,7 @@ def successor_loss(successor: Tensor, target: Tensor) -> Tensor:
     tensor([2.5000])
     """
     _assert_same_shape(successor_loss, successor=successor, target=target)
-    return (target.detach() - successor).square().mean(-1)
+    return mse_loss(successor, target.detach(), reduction="none").mean(-1)
 
 
 def policy_gradient_loss(log_prob: Tensor, advantage: Tensor) -> Tensor:

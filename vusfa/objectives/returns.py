@@ -21,6 +21,7 @@ from torch import Tensor
 from torchrl.modules import set_recurrent_mode
 from torchrl.objectives.value import ValueEstimatorBase
 
+from vusfa.objectives.distinct import spread
 from vusfa.objectives.functional import lambda_return, n_step_return
 from vusfa.objectives.keys import EstimatorKeys
 
@@ -143,6 +144,7 @@ class USFEstimator(ValueEstimatorBase):
         target_params: TensorDictBase | None = None,
         time_dim: int | None = None,
         written: TensorDictBase | None = None,
+        index: Tensor | None = None,
     ) -> TensorDictBase:
         """Write the targets into a rollout.
 
@@ -154,6 +156,7 @@ class USFEstimator(ValueEstimatorBase):
             time_dim: the dimension of time.
             written: ``(*batch, T)``, what the critic writes at the root states, by whoever has run it there
                 already. Not differentiated. A recurrent critic is run all the same.
+            index: ``(*batch, T)``, for a ``written`` of distinct rows ``(D,)``: which of them each step's is.
 
         Returns:
             the same tensordict, with ``advantage`` and ``value_target``, ``(*batch, T, 1)``, and
@@ -169,9 +172,10 @@ class USFEstimator(ValueEstimatorBase):
         time_dim = self._get_time_dim(time_dim, tensordict)
         last = tensordict.batch_dims - 1
         data = tensordict if time_dim == last else tensordict.transpose(time_dim, last)
-        if written is not None and time_dim != last:
-            written = written.transpose(time_dim, last)
-        targets = self._targets(data, params if target_params is None else target_params, written)
+        if time_dim != last:
+            index = None if index is None else index.transpose(time_dim, last)
+            written = written if written is None or index is not None else written.transpose(time_dim, last)
+        targets = self._targets(data, params if target_params is None else target_params, written, index)
         if time_dim != last:
             targets = targets.transpose(time_dim, last)
         return tensordict.update(targets)
@@ -193,7 +197,11 @@ class USFEstimator(ValueEstimatorBase):
 
     @torch.no_grad()
     def _targets(
-        self, data: TensorDictBase, params: TensorDictBase | None, written: TensorDictBase | None
+        self,
+        data: TensorDictBase,
+        params: TensorDictBase | None,
+        written: TensorDictBase | None,
+        index: Tensor | None,
     ) -> TensorDict:
         keys = self.tensor_keys
         reward = data.get(("next", keys.reward))
@@ -204,28 +212,27 @@ class USFEstimator(ValueEstimatorBase):
         mask = data.get(MASK_KEY, None)
         ended = _cut_at_padding(done, mask)
 
-        wanted = [keys.value]
+        wanted, at_root = [keys.value], [keys.value]
         if self.has_successor:
             wanted += [keys.successor_features, keys.state_embedding]
+            at_root += [keys.state_embedding] if self.embedding_at == "current" else []
         with (
             contextlib.nullcontext()
             if params is None
             else params.to_module(self.value_network, preserve_module_state=False)
         ):
-            root, following = evaluate_rollout(self.value_network, data, ended.any(-1), wanted, written)
+            root, following = evaluate_rollout(
+                self.value_network, data, ended.any(-1), wanted, written, index, at_root
+            )
         value, next_value = root[0].to(reward.dtype), following[0].to(reward.dtype)
         if not self.has_successor:
             value_target = self._return(reward, next_value, ended, terminated)
         else:
-            embedding = following[2] if self.embedding_at == "next" else root[2]
-            # reward and embedding are summed by the same recursion: one vector, one pass
-            both = self._return(
-                torch.cat([reward, embedding.to(reward.dtype)], -1),
-                torch.cat([next_value, following[1].to(reward.dtype)], -1),
-                ended.any(-1, keepdim=True),
-                terminated.any(-1, keepdim=True),
-            )
-            value_target, successor_target = both.split([reward.shape[-1], embedding.shape[-1]], -1)
+            embedding = following[2] if self.embedding_at == "next" else root[1]
+            # reward and embedding are summed by the same recursion
+            ends = ended.any(-1, keepdim=True), terminated.any(-1, keepdim=True)
+            value_target = self._return(reward, next_value, *ends)
+            successor_target = self._return(embedding.to(reward.dtype), following[1].to(reward.dtype), *ends)
         advantage = value_target - value
         if self.normalize_advantage:
             advantage = _normalize(advantage, mask, self.min_advantage_std)
@@ -248,6 +255,8 @@ def evaluate_rollout(
     ended: Tensor,
     out_keys: list[NestedKey],
     written: TensorDictBase | None = None,
+    index: Tensor | None = None,
+    at_root: list[NestedKey] | None = None,
 ) -> tuple[list[Tensor], list[Tensor]]:
     """A critic's outputs at the states of a rollout and at those that its steps lead to.
 
@@ -259,10 +268,12 @@ def evaluate_rollout(
         out_keys: the outputs wanted.
         written: ``(*batch, T)``, the outputs at the root states, where they are known; not for recurrent
             critics.
+        index: ``(*batch, T)``, for a ``written`` of distinct rows ``(D,)``: which of them each step's is.
+        at_root: the outputs wanted at the root states; all of ``out_keys`` when not given.
 
     Returns:
-        two lists in the order of ``out_keys``, of ``(*batch, T, ...)``: at the root states, and at the next
-        states.
+        two lists, of ``(*batch, T, ...)``: at the root states, in the order of ``at_root``, and at the next
+        states, in that of ``out_keys``.
     """
     in_keys = [unravel_key(key) for key in critic.in_keys]  # type: ignore[attr-defined]
     root = data.select(*in_keys, strict=False)
@@ -270,7 +281,8 @@ def evaluate_rollout(
     outside = ended.clone()
     outside[..., -1] = True
     if any((key if isinstance(key, str) else key[-1]) == "is_init" for key in in_keys):
-        return _evaluate_sequences(critic, root, following, outside, in_keys, out_keys)
+        first, second = _evaluate_sequences(critic, root, following, outside, in_keys, out_keys)
+        return first if at_root is None else [first[out_keys.index(key)] for key in at_root], second
 
     # states are independent of each other: one flat batch of the roots, unless they are known, and of next
     # states that are no root
@@ -280,18 +292,27 @@ def evaluate_rollout(
     ends = _complete(following.reshape(-1)[rows], root[rows], in_keys)
     if written is None:
         outputs = critic(torch.cat([root, ends]))
-        values = [outputs.get(key) for key in out_keys]
+        values = {key: outputs.get(key) for key in out_keys}
     else:
         outputs = critic(ends)
-        known = [written.get(key) for key in out_keys]
-        pairs = zip(known, [outputs.get(key) for key in out_keys], strict=True)
-        values = [torch.cat([at_root.reshape(steps, *end.shape[1:]), end]) for at_root, end in pairs]
-    next_rows = torch.arange(1, steps + 1, device=rows.device)
-    next_rows[rows] = torch.arange(steps, steps + len(rows), device=rows.device)
-    return (
-        [value[:steps].reshape(*shape, *value.shape[1:]) for value in values],
-        [value[next_rows].reshape(*shape, *value.shape[1:]) for value in values],
-    )
+        values = {}
+        for key in out_keys:
+            known, end = written.get(key), outputs.get(key)
+            values[key] = torch.cat([known.reshape(-1, *end.shape[1:]), end])
+    root_rows = torch.arange(steps, device=rows.device) if index is None else index.reshape(-1)
+    next_rows = root_rows.roll(-1)
+    known_rows = len(values[out_keys[0]]) - len(rows)
+    next_rows[rows] = torch.arange(known_rows, known_rows + len(rows), device=rows.device)
+
+    def taken(key: NestedKey, places: Tensor) -> Tensor:
+        return spread(values[key], places.view(shape))
+
+    def whole(key: NestedKey) -> Tensor:
+        return values[key][:steps].reshape(*shape, *values[key].shape[1:])
+
+    wanted = out_keys if at_root is None else at_root
+    first = [whole(key) if index is None else taken(key, root_rows) for key in wanted]
+    return first, [taken(key, next_rows) for key in out_keys]
 
 
 def _evaluate_sequences(

@@ -48,11 +48,15 @@ class Results(NamedTuple):
     """What one pass through both networks gave.
 
     ``latent_size`` is the number of features of the latent whose divergence ``written`` tells without it.
+    Where the networks ran on distinct rows, ``rows`` is what they wrote there and ``which`` (\\*batch) tells
+    each step's row; ``written`` then holds what the terms read.
     """
 
     distribution: Distribution
     written: TensorDictBase
     latent_size: int = 0
+    rows: TensorDictBase | None = None
+    which: Tensor | None = None
 
 
 class USFLoss(LossModule):
@@ -299,7 +303,11 @@ class USFLoss(LossModule):
         if tensordict.get(self.tensor_keys.advantage, None) is None:
             params, estimator = self.critic_network_params, self.value_estimator
             # the estimator needs the critic at the same states
-            known = {"written": results.written} if isinstance(estimator, USFEstimator) else {}
+            known: dict[str, Any] = {}
+            if isinstance(estimator, USFEstimator):
+                known = {"written": results.written}
+                if results.rows is not None:
+                    known = {"written": results.rows, "index": results.which}
             estimator(tensordict, params=params, target_params=params, **known)
         out = TensorDict({}, batch_size=[])
         if self.objective_coeff is not None:
@@ -420,17 +428,18 @@ class USFLoss(LossModule):
         with self._params_of("critic_network"):
             written = run_critic(critic, inputs.select(*critic.in_keys, strict=False), memory)
         if index is not None:
-            rows = {key: spread(written.get(key), index) for key in self._read() if key in written.keys(True)}
+            each = {key: spread(written.get(key), index) for key in self._read()}
             sizes = [written.get(loc).shape[-1] for loc, *_ in self._branches()]
-            return Results(distribution, TensorDict(rows, index.shape), sizes[0] if sizes else 0)
+            latent_size = sizes[0] if sizes else 0
+            return Results(distribution, TensorDict(each, index.shape), latent_size, written, index)
         return Results(distribution, written)
 
     def _read(self) -> list[NestedKey]:
-        """What terms and targets read of what the critic writes."""
+        """What the terms read of what the critic writes."""
         keys = self.tensor_keys
         names: list[NestedKey] = [keys.value]
-        if self._writes(keys.successor_features, keys.state_embedding):
-            names += [keys.successor_features, keys.state_embedding]
+        if self.has_successor:
+            names.append(keys.successor_features)
         for loc, scale, known in self._branches():
             names += [known] if self._writes(known) else [loc, scale]
         return list(dict.fromkeys(unravel_key(key) for key in names))

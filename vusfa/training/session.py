@@ -30,6 +30,7 @@ from vusfa.training.checkpoint import (
 from vusfa.training.collectors import close_collector, collector_state, load_collector_state
 from vusfa.training.learning import loss_state
 from vusfa.training.loggers import flat
+from vusfa.training.memory import keep_memory
 from vusfa.training.metrics import EpisodeMeter, MeanMeter
 from vusfa.training.replay import HindsightReplay
 
@@ -268,7 +269,8 @@ def make_observation(agent: Agent, scenes: SceneSet, crop: str = "first") -> Sce
 
 
 def set_threads(threads: int) -> None:
-    """Sets how many processor threads torch computes with in this process.
+    """Sets how many processor threads torch computes with in this process, and has it keep its memory
+    (:func:`~vusfa.training.memory.keep_memory`).
 
     Raises:
         ConfigError: fewer than one.
@@ -282,6 +284,7 @@ def set_threads(threads: int) -> None:
     if threads < 1:
         raise ConfigError(f"threads is {threads}; give 1 or more")
     torch.set_num_threads(threads)
+    keep_memory()
 
 
 def torch_device(name: str) -> torch.device:
