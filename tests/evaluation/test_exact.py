@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from vusfa.evaluation import evaluate
-from vusfa.evaluation.exact import agent_probabilities, exact_goals, reach_step
+from vusfa.evaluation.exact import agent_probabilities, exact_goals, expected_walks, reach_step
 from vusfa.evaluation.metrics import spl
 from vusfa.modules import ActingPolicy, Agent, make_agent
 from vusfa.scenes import Scene, SceneSet
@@ -83,3 +83,32 @@ def test_goals_are_computed_together_or_apart(rooms: SceneSet, agent: Agent) -> 
 def test_an_agent_of_more_frames_is_refused(rooms: SceneSet) -> None:
     with pytest.raises(ValueError, match="history=4"):
         agent_probabilities(make_agent("gvf", scenes=rooms))
+
+
+def test_expected_walks_in_a_corridor_by_hand() -> None:
+    """Three states in a row, forward with the chance of one half, else blocked, at most four actions."""
+    corridor = torch.tensor([[1, -1], [2, -1], [1, -1]])
+    scenes = SceneSet([Scene("corridor", corridor, torch.rand(3, 1, 4))])
+    walks = expected_walks(None, scenes, torch.tensor([2]), max_steps=4)
+    near = [0.5**k for k in range(1, 5)]  # from the middle: the chance of arriving with the k-th action
+    far = [0.0, *((k - 1) * 0.5**k for k in range(2, 5))]
+    lengths = [
+        sum(k * p for k, p in enumerate(chances, 1)) + 4 * (1 - sum(chances)) for chances in (near, far)
+    ]
+    arrived = [sum(k * p for k, p in enumerate(chances, 1)) for chances in (near, far)]
+    assert walks.length.tolist() == pytest.approx([sum(lengths) / 2])
+    assert walks.success.tolist() == pytest.approx([(sum(near) + sum(far)) / 2])
+    assert walks.shortest.tolist() == [1.5]
+    assert walks.length_ratio == pytest.approx(sum(arrived) / (1 * sum(near) + 2 * sum(far)))
+
+
+def test_expected_walks_of_an_agent_beside_the_table_of_all_goals(rooms: SceneSet, agent: Agent) -> None:
+    chances, every = agent_probabilities(agent), exact_goals(agent_probabilities(agent), rooms)
+    goals = torch.tensor([2, 7, 18])
+    rows = [int(((every.scene == scene) & (every.goal == goal)).nonzero()) for scene, goal in
+            ((0, 2), (0, 7), (1, 2))]  # fmt: skip
+    for steps, column in ((100, every.success_100), (500, every.success_500)):
+        walks = expected_walks(chances, rooms, goals, steps)
+        torch.testing.assert_close(walks.success, column[rows], atol=1e-4, rtol=1e-4)
+    assert bool((walks.length >= walks.shortest).all())
+    assert walks.length_ratio > 1

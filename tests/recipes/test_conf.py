@@ -104,8 +104,9 @@ def test_fast_is_controlled_but_for_the_clock(settings):
     changed = {key for key in fast.agent if fast.agent[key] != controlled.agent[key]}
     assert changed == {"history", "hidden_size", "embedding_size"}
     assert fast.agent.preset == "controlled"
-    assert (fast.agent.history, fast.collector.rollout, fast.autocast) == (1, 50, True)
-    assert fast.entropy == {"start": 0.01, "end": 0.001, "horizon": 4_000_000}
+    assert (fast.agent.history, fast.collector.num_envs, fast.collector.rollout) == (1, 256, 50)
+    assert (fast.autocast, fast.optim.lr, fast.optim.horizon) == (True, 1e-3, 6_000_000)
+    assert fast.entropy == {"start": 0.005, "end": 0.001, "horizon": 6_000_000}
 
 
 def test_the_numbers_of_controlled(settings):

@@ -31,5 +31,5 @@ def test_pages_are_not_asked_for_again() -> None:
         how: int(subprocess.run([sys.executable, "-c", FAULTS, how], capture_output=True, check=True).stdout)
         for how in ("keep", "leave")
     }
-    # twenty blocks of 16 MB are asked for in turn; kept, one or two of them may still be new, as the heap settles
+    # twenty blocks of 16 MB are asked for in turn; one or two that are kept may still be new
     assert faults["keep"] < faults["leave"] / 4

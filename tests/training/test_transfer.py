@@ -8,6 +8,9 @@ import pytest
 import torch
 from omegaconf import OmegaConf
 
+from vusfa.evaluation import evaluate
+from vusfa.evaluation.metrics import length_ratio
+from vusfa.modules import ActingPolicy
 from vusfa.scenes import SceneSet
 from vusfa.training import load_agent
 from vusfa.training.launch import compose
@@ -38,13 +41,21 @@ def config(scene_file: Path) -> dict[str, Any]:
 
 
 @pytest.fixture
-def checkpoint(config: dict[str, Any], tmp_path: Path) -> Path:
-    training = make_training(config)
-    with training.session.collecting(training.make_collector) as batches:
-        training.update(batches)
-        with torch.no_grad():
-            training.session.loss.bottleneck_coeff.fill_(0.25)
-        return training.session.save(tmp_path / "checkpoint.pt")
+def checkpoint_of(tmp_path: Path) -> Callable[[dict[str, Any]], Path]:
+    def make(config: dict[str, Any]) -> Path:
+        training = make_training(config)
+        with training.session.collecting(training.make_collector) as batches:
+            training.update(batches)
+            with torch.no_grad():
+                training.session.loss.bottleneck_coeff.fill_(0.25)
+            return training.session.save(tmp_path / "checkpoint.pt")
+
+    return make
+
+
+@pytest.fixture
+def checkpoint(config: dict[str, Any], checkpoint_of: Callable[..., Path]) -> Path:
+    return checkpoint_of(config)
 
 
 def test_schedules_end_with_the_new_training(config: dict[str, Any]) -> None:
@@ -56,8 +67,10 @@ def test_schedules_end_with_the_new_training(config: dict[str, Any]) -> None:
     assert config["env"]["goals"] == [3, 9, 12]
 
 
-def test_a_curve(config: dict[str, Any], checkpoint: Path) -> None:
-    _, scenes, state = load_agent(checkpoint)
+@pytest.mark.parametrize("history", [1, 3])  # computed, and walked
+def test_a_curve(history: int, config: dict[str, Any], checkpoint_of: Callable[..., Path]) -> None:
+    config["agent"]["history"] = history
+    _, scenes, state = load_agent(checkpoint_of(config))
     settings = fine_tuning_settings(state["config"], torch.tensor([5, 6]), frames=96, seed=4)
     curve = fine_tune(state, settings, scenes, every=48)
     assert curve["frames"] == [0, 48, 96]
@@ -94,3 +107,16 @@ def test_trained_on_begins_where_the_agent_was_and_scratch_does_not(
     assert torch.equal(seen[0][weight], state["agent"][weight])
     assert not torch.equal(seen[1][weight], state["agent"][weight])
     assert (seen[0]["beta"], seen[1]["beta"]) == (0.25, pytest.approx(0.0, abs=0.01))
+
+
+def test_what_is_computed_beside_what_is_walked(config: dict[str, Any], checkpoint: Path) -> None:
+    """Three goals, 3000 episodes each: a one-frame agent's curve lies within five standard errors."""
+    agent, scenes, state = load_agent(checkpoint)
+    goals = torch.tensor([5, 6, 14])
+    curve = fine_tune(state, fine_tuning_settings(config, goals, 1, seed=4), scenes, every=1000)
+    table = evaluate(ActingPolicy(agent), scenes, goals, episodes_per_goal=3000, max_steps=20, history=1)
+    length = table.length.double()
+    assert curve["length"][0] == pytest.approx(length.mean().item(), abs=5 * 8 / 9000**0.5)
+    assert curve["success"][0] == pytest.approx(table.success.double().mean().item(), abs=5 * 0.5 / 9000**0.5)
+    ratio = length_ratio(table.success, table.length, table.shortest)
+    assert curve["length_ratio"][0] == pytest.approx(ratio, rel=0.05)

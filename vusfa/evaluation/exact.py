@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, fields
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -20,7 +21,14 @@ from torch import Tensor
 from vusfa.modules import Agent, action_logits, frozen
 from vusfa.scenes import SceneSet
 
-__all__ = ["ExactGoals", "agent_probabilities", "exact_goals", "reach_step"]
+__all__ = [
+    "ExactGoals",
+    "ExpectedWalks",
+    "agent_probabilities",
+    "exact_goals",
+    "expected_walks",
+    "reach_step",
+]
 
 Probabilities = Callable[[Tensor, Tensor, Tensor], Tensor]
 
@@ -93,6 +101,76 @@ def agent_probabilities(agent: Agent, greedy: bool = False) -> Probabilities:
         return logits.softmax(-1)
 
     return probabilities
+
+
+class ExpectedWalks(NamedTuple):
+    """Walks of at most K actions to goals: means over all starts that a goal can be reached from, (G,)
+    float64 each.
+
+    Attributes:
+        length: actions; a walk that does not arrive counts with all K.
+        success: chance of arriving.
+        arrived_length: actions of walks that arrive, the others counting 0.
+        arrived_shortest: actions of the shortest path from where walks that arrive began, the others 0.
+        shortest: actions of the shortest path.
+    """
+
+    length: Tensor
+    success: Tensor
+    arrived_length: Tensor
+    arrived_shortest: Tensor
+    shortest: Tensor
+
+    @property
+    def length_ratio(self) -> float:
+        """Actions of arriving walks over those of their shortest paths: a ratio of means over goals."""
+        return (self.arrived_length.sum() / self.arrived_shortest.sum()).item()
+
+
+@torch.no_grad()
+def expected_walks(
+    probabilities: Probabilities | None, scenes: SceneSet, goals: Tensor, max_steps: int = 500
+) -> ExpectedWalks:
+    r"""What walks to some goals come to in expectation; computed, not sampled. With T the actions until
+    arrival, K ``max_steps`` and h_k the chance of having arrived within k,
+
+    .. math:: E[\min(T, K)] = \sum_{k=0}^{K-1} (1 - h_k), \quad
+              E[T; T \le K] = \sum_{k=1}^{K} k (h_k - h_{k-1})
+
+    Args:
+        probabilities: of actions, see :func:`agent_probabilities`; None for a random walk.
+        scenes: the world.
+        goals: (G,) global ids, scene by scene.
+        max_steps: K.
+
+    >>> walks = expected_walks(None, SceneSet.bundled(["bathroom"]), torch.tensor([3, 90]))
+    >>> 500 > walks.length.mean().item() > 10 * walks.shortest.mean().item() > 10
+    True
+    """
+    parts = []
+    for index, scene in enumerate(scenes.scenes):
+        first = int(scenes.offsets[index])
+        here = goals[scenes.scene_id[goals] == index] - first
+        successor = scenes.successor[first : first + scene.num_states] - first
+        if probabilities is None:
+            acts = torch.full((len(here), *successor.shape), 1 / successor.shape[1], dtype=torch.float64)
+        else:
+            state = torch.arange(scene.num_states).repeat(len(here)) + first
+            goal = here.repeat_interleave(scene.num_states) + first
+            told = probabilities(state, goal, torch.full_like(state, index))
+            acts = told.view(len(here), *successor.shape).double()
+        chance = torch.zeros(len(here), scene.num_states, dtype=torch.float64)
+        chance[torch.arange(len(here)), here] = 1
+        length, arrived = torch.zeros_like(chance), torch.zeros_like(chance)
+        for k in range(1, max_steps + 1):
+            length += 1 - chance
+            before, chance = chance, reach_step(acts, successor, here, chance)
+            arrived += k * (chance - before)
+        shortest = scene.distance[:, here].T
+        counted = shortest > 0
+        columns = (length, chance, arrived, chance * shortest, shortest.double())
+        parts.append([(column * counted).sum(1) / counted.sum(1) for column in columns])
+    return ExpectedWalks(*(torch.cat(column) for column in zip(*parts, strict=True)))
 
 
 @torch.no_grad()

@@ -24,6 +24,7 @@ class TabulatedPolicy(TensorDictModuleBase):
     Args:
         agent: as it now is; later updates do not reach the table.
         scenes: its world.
+        goals: (G,) global ids of the only goals that will be asked for; None for all states.
         at_once: pairs of state and goal that are computed together.
 
     Raises:
@@ -39,10 +40,12 @@ class TabulatedPolicy(TensorDictModuleBase):
     (torch.Size([3]), torch.Size([1, 4]))
     """
 
-    def __init__(self, agent: Agent, scenes: SceneSet, at_once: int = 50_000) -> None:
+    def __init__(
+        self, agent: Agent, scenes: SceneSet, goals: Tensor | None = None, *, at_once: int = 50_000
+    ) -> None:
         super().__init__()
         self.in_keys, self.out_keys = ["state_id", "goal_id"], ["action"]
-        self._pairs, was = StateGoalPairs(scenes), agent.training
+        self._pairs, was = StateGoalPairs(scenes, goals), agent.training
         agent.eval()
         try:
             with frozen(agent):

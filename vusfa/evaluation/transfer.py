@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from vusfa.errors import GoalError
-from vusfa.evaluation.exact import reach_step
+from vusfa.evaluation.exact import expected_walks
 from vusfa.scenes import SceneSet
 
 __all__ = ["KINDS", "area_under", "frames_to", "new_goals", "walked_lengths"]
@@ -70,40 +70,20 @@ def new_goals(
 
 
 def walked_lengths(scenes: SceneSet, goals: Tensor, max_steps: int = 500) -> tuple[float, float]:
-    r"""Actions an episode of a random walk and of the shortest path, means over goals and over all starts
-    that a goal can be reached from; computed, not sampled.
-
-    .. math:: E[\min(T, K)] = \sum_{k=0}^{K-1} (1 - h_k)
-
-    with h_k the chance of having arrived within k actions, see :func:`~vusfa.evaluation.exact.reach_step`: an
-    episode that does not arrive counts with all the actions that it was allowed.
+    """Actions an episode of a random walk and of the shortest path, means over goals and over all starts
+    that a goal can be reached from, see :func:`~vusfa.evaluation.exact.expected_walks`.
 
     Args:
         scenes: the world.
-        goals: (G,) global ids.
-        max_steps: K.
+        goals: (G,) global ids, scene by scene.
+        max_steps: that a walk may take; one that does not arrive counts with all of them.
 
     >>> walk, shortest = walked_lengths(SceneSet.bundled(["bathroom"]), torch.tensor([3, 90]))
     >>> 500 > walk > 10 * shortest > 10
     True
     """
-    walks, paths = [], []
-    for index, scene in enumerate(scenes.scenes):
-        first = int(scenes.offsets[index])
-        here = goals[scenes.scene_id[goals] == index] - first
-        successor = scenes.successor[first : first + scene.num_states] - first
-        fair = torch.full((len(here), *successor.shape), 1 / successor.shape[1], dtype=torch.float64)
-        chance = torch.zeros(len(here), scene.num_states, dtype=torch.float64)
-        chance[torch.arange(len(here)), here] = 1
-        expected = torch.zeros_like(chance)
-        for _ in range(max_steps):
-            expected += 1 - chance
-            chance = reach_step(fair, successor, here, chance)
-        shortest = scene.distance[:, here].T
-        counted = shortest > 0
-        walks.append((expected * counted).sum(1) / counted.sum(1))
-        paths.append((shortest * counted).sum(1) / counted.sum(1))
-    return torch.cat(walks).mean().item(), torch.cat(paths).double().mean().item()
+    walks = expected_walks(None, scenes, goals, max_steps)
+    return walks.length.mean().item(), walks.shortest.mean().item()
 
 
 def area_under(frames: Sequence[float], values: Sequence[float]) -> float:

@@ -9,10 +9,12 @@ from typing import Any
 from torch import Tensor
 
 from vusfa.evaluation import evaluate
+from vusfa.evaluation.exact import expected_walks
 from vusfa.evaluation.metrics import length_ratio
-from vusfa.modules import ActingPolicy
+from vusfa.evaluation.tabulated import TabulatedPolicy
+from vusfa.modules import ActingPolicy, sees_one_frame
 from vusfa.scenes import SceneSet
-from vusfa.training.setup import make_training
+from vusfa.training.setup import Training, make_training
 
 __all__ = ["fine_tune", "fine_tuning_settings"]
 
@@ -53,8 +55,9 @@ def fine_tune(
         settings: see :func:`fine_tuning_settings`.
         scenes: the world.
         every: frames between two evaluations.
-        episodes_per_goal: of an evaluation, from the same starts each time; actions are drawn. An episode
-            that does not arrive counts with all the actions that it was allowed.
+        episodes_per_goal: of an evaluation, from the same starts each time, for agents that see more than
+            one frame; what one-frame agents do is computed, not sampled. Actions are drawn. An episode that
+            does not arrive counts with all the actions that it was allowed.
 
     Returns:
         the curve: ``frames``, and at each ``length`` (actions), ``success`` and ``length_ratio``.
@@ -63,24 +66,12 @@ def fine_tune(
     session = training.session
     if state is not None:
         session.adopt(state)
-    policy = training.actor if session.agent.memory is not None else ActingPolicy(session.agent)
     curve: dict[str, list[float]] = {key: [] for key in ("frames", "length", "success", "length_ratio")}
 
     def look() -> None:
-        table = evaluate(
-            policy,
-            session.scenes,
-            session.goals,
-            episodes_per_goal=episodes_per_goal,
-            max_steps=settings["env"]["max_steps"],
-            history=session.agent.config["history"],
-            seed=0,
-            observe=training.observation,
-        )
-        curve["frames"].append(float(session.frames))
-        curve["length"].append(table.length.double().mean().item())
-        curve["success"].append(table.success.double().mean().item())
-        curve["length_ratio"].append(length_ratio(table.success, table.length, table.shortest))
+        seen = _expected(training) if sees_one_frame(session.agent) else _walked(training, episodes_per_goal)
+        for key, value in zip(curve, (float(session.frames), *seen), strict=True):
+            curve[key].append(value)
 
     look()
     with session.collecting(training.make_collector) as batches:
@@ -92,3 +83,29 @@ def fine_tune(
             if ended or before // every < session.frames // every:
                 look()
     return curve
+
+
+def _expected(training: Training) -> tuple[float, float, float]:
+    """Length, success and length over shortest path of an agent that sees one frame: computed."""
+    session, steps = training.session, training.settings["env"]["max_steps"]
+    policy = TabulatedPolicy(session.agent, session.scenes, session.goals)
+    walks = expected_walks(policy.probabilities, session.scenes, session.goals, steps)
+    return walks.length.mean().item(), walks.success.mean().item(), walks.length_ratio
+
+
+def _walked(training: Training, episodes_per_goal: int) -> tuple[float, float, float]:
+    """The same of any other: of episodes that are walked."""
+    session = training.session
+    table = evaluate(
+        training.actor if session.agent.memory is not None else ActingPolicy(session.agent),
+        session.scenes,
+        session.goals,
+        episodes_per_goal=episodes_per_goal,
+        max_steps=training.settings["env"]["max_steps"],
+        history=session.agent.config["history"],
+        seed=0,
+        observe=training.observation,
+    )
+    success, length = table.success, table.length
+    mean_length, mean_success = length.double().mean().item(), success.double().mean().item()
+    return mean_length, mean_success, length_ratio(success, length, table.shortest)
