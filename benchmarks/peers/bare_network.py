@@ -109,16 +109,20 @@ class BareNetwork:
         fused = functional.linear(embedding.to(fusion.dtype), fusion, w["fusion.linear.bias"])
         return Goals(fused, loc, scale, embedding)
 
-    def rows(self, w: Weights, states: Tensor, goals: Goals, rows: Rows) -> Outputs:
-        """Everything that does not hang on the noise of a latent, in the order of ``rows``."""
+    def rows(self, w: Weights, states: Tensor, goals: Goals, rows: Rows, *, acting: bool = False) -> Outputs:
+        """Everything that does not hang on the noise of a latent, in the order of ``rows``; without the
+        scales where they are for ``acting`` alone, which reads none."""
         if self.config["history"] == 1:
             code = functional.embedding(rows.state.squeeze(-1), states)
         else:
             history = rows.state.shape[-1]
             places = rows.state * history + torch.arange(history)
             sums = functional.embedding_bag(places, states, mode="sum")
-            code = self._finish(w, sums + w["encoder.first.bias"])
-        loc, scale = self._gaussian(code.float())
+            code = self._finish(w, sums + w["encoder.first.bias"], half=acting and self.ideas.bottleneck)
+        if acting:
+            loc, scale = code.float()[:, : self.config["embedding_size"]], None
+        else:
+            loc, scale = self._gaussian(code.float())
         embedding = functional.layer_norm(loc, loc.shape[-1:])
         half = w["fusion.linear.weight"].dtype
         fused = functional.linear(
@@ -163,8 +167,10 @@ class BareNetwork:
         last = functional.linear(first.relu(), w["reward.last.weight"], w["reward.last.bias"])
         return self.config["reward_scale"] * last.float()
 
-    def _finish(self, w: Weights, first: Tensor) -> Tensor:
-        return functional.linear(first.relu(), w["encoder.last.weight"], w["encoder.last.bias"])
+    def _finish(self, w: Weights, first: Tensor, half: bool = False) -> Tensor:
+        outputs = len(w["encoder.last.bias"]) // (2 if half else 1)
+        last = w["encoder.last.weight"][:outputs], w["encoder.last.bias"][:outputs]
+        return functional.linear(first.relu(), *last)
 
     def _gaussian(self, code: Tensor) -> tuple[Tensor, Tensor | None]:
         if not self.ideas.bottleneck:

@@ -109,7 +109,7 @@ class BareTraining:
             state, goal, scene = env.state, self.slot[env.goal], env.scene
             rows = group(state, goal, scene, self.net.num_scenes)
             logits = torch.empty(env.rows, env.num_actions)
-            logits[rows.order] = self.net.rows(w, states, goals, rows).logits
+            logits[rows.order] = self.net.rows(w, states, goals, rows, acting=True).logits
             # a draw from the softmax: the largest of logits with Gumbel noise
             action = (logits - torch.empty_like(logits).exponential_().log_()).argmax(-1)
             after = env.step(action)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
+from benchmarks.peers.bare_network import group
 from benchmarks.peers.bare_update import BareTraining, Batch, Noise
 from benchmarks.trainer import make_trainer
 from vusfa.training import total_loss
@@ -55,6 +56,21 @@ def test_loss_and_gradients_are_those_of_the_library(model: str, history: int, t
     for (name, theirs), ours in zip(net.params.items(), session.agent.parameters(), strict=True):
         scale = float(ours.grad.abs().max())
         torch.testing.assert_close(theirs.grad, ours.grad, rtol=1e-3, atol=1e-4 * scale + 1e-9, msg=name)
+
+
+@pytest.mark.parametrize("history", [1, 4])
+@pytest.mark.parametrize("model", ["gvf", "vusfa"])
+def test_acting_leaves_out_what_logits_do_not_need(model: str, history: int, tiny):
+    trainer = make_trainer(tiny(f"agent.model={model}", f"agent.history={history}", "autocast=false"))
+    bare, batch = BareTraining(trainer), next(trainer.batches)
+    plain = _as_bare(batch, bare)
+    columns = plain.state.flatten(0, 1), plain.goal.flatten(), plain.scene.flatten()
+    rows, w = group(*columns, bare.net.num_scenes), bare.net.weights()
+    states, goals = bare.net.states(w), bare.net.goals(w, bare.goal_ids)
+    every, some = (bare.net.rows(w, states, goals, rows, acting=acting) for acting in (False, True))
+    assert some.scale is None
+    torch.testing.assert_close(some.logits, every.logits)
+    trainer.close()
 
 
 def test_updates_move_every_weight_and_the_multiplier(tiny):

@@ -6,6 +6,8 @@ from tensordict import TensorDict
 
 from vusfa.errors import ConfigError
 from vusfa.modules import FeatureFrames, GaussianEncoder, LatentSampler, SiameseEncoder, make_agent
+from vusfa.modules.siamese import NormalisedEncoder
+from vusfa.modules.trunk import Fusion, SiameseTrunk
 from vusfa.scenes import SceneSet
 
 
@@ -43,6 +45,25 @@ class TestGaussianEncoder:
         _, _, loc, scale, *_ = module(*inputs)
         assert scale.median().item() == pytest.approx(initial_scale, rel=0.25)
         assert torch.equal(loc, gaussian(scenes)(*inputs)[2])  # the means are left alone
+
+    def test_what_is_made_of_the_means_needs_no_scales(
+        self, scenes: SceneSet, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        module = gaussian(scenes)
+        trunk = SiameseTrunk(NormalisedEncoder(module), Fusion(8, 12))
+        inputs = torch.randint(21, (30, 4)), torch.randint(21, (30,))
+        wanted = trunk(*inputs)[-1]
+        halves: list[bool] = []
+        finish = module.encoder.branch.finish
+        monkeypatch.setattr(
+            module.encoder.branch,
+            "finish",
+            lambda *given, half=False: halves.append(half) or finish(*given, half=half),
+        )
+        torch.testing.assert_close(trunk.fused(*inputs), wanted)
+        assert halves == [True, False]  # of states, row by row; goals are few
+        trunk(*inputs)
+        assert halves[2:] == [False, False]
 
     @pytest.mark.parametrize(
         ("options", "message"),

@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from vusfa.errors import ConfigError
-from vusfa.modules.siamese import Head, Heads, SiameseEncoder, as_it_is, interleaved
+from vusfa.modules.siamese import Head, Heads, SiameseEncoder, as_it_is, interleaved, num_parts
 from vusfa.objectives.functional import gaussian_kl
 
 __all__ = ["GaussianEncoder", "LatentSampler"]
@@ -89,6 +89,12 @@ class _Gaussian(NamedTuple):
         made = self.head(loc)
         kl = gaussian_kl(loc, scale).sum(-1, keepdim=True)
         return *(made if isinstance(made, tuple) else (made,)), loc, scale, kl
+
+    def alone(self, part: int) -> Head | None:
+        """The head of this part alone, where it is made of the means, which are the code's leading half."""
+        if part >= num_parts(self.head):
+            return None
+        return lambda loc: self.head(loc)[part] if num_parts(self.head) > 1 else self.head(loc)
 
 
 class LatentSampler(nn.Module):

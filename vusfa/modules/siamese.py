@@ -30,7 +30,9 @@ from vusfa.modules.linear import HistoryLinear, SceneLinear
 __all__ = ["Branch", "Head", "Heads", "NormalisedEncoder", "SiameseEncoder", "frozen"]
 
 #: What follows the encoder row by row: codes (D, out) to one or several tensors of D rows. One for states and
-#: one for goals; hashable, and equal where they do the same.
+#: one for goals; hashable, and equal where they do the same. A head may have a method ``alone``: of a part's
+#: index, the head that makes this part, and nothing else, of the leading half of a code; None where that half
+#: does not tell.
 Head = Callable[[Tensor], Any]
 Heads = tuple[Any, Any]
 
@@ -50,12 +52,18 @@ class Branch(nn.Module):
         self.first = HistoryLinear(history, in_features, hidden_size)
         self.last = None if out_features is None else nn.Linear(hidden_size, out_features)
 
-    def finish(self, first: Tensor, extra: nn.Module | None = None) -> Tensor:
-        """What follows the first layer's sums (\\*B, hidden_size): ReLU, ``extra`` with ReLU, last layer."""
+    def finish(self, first: Tensor, extra: nn.Module | None = None, *, half: bool = False) -> Tensor:
+        """What follows the first layer's sums (\\*B, hidden_size): ReLU, ``extra`` with ReLU, last layer; of
+        that all outputs, or the leading half."""
         code = functional.relu(first)
         if extra is not None:
             code = functional.relu(extra(code))
-        return code if self.last is None else self.last(code)
+        if self.last is None:
+            return code
+        if half:
+            outputs = self.last.out_features // 2
+            return functional.linear(code, self.last.weight[:outputs], self.last.bias[:outputs])
+        return self.last(code)
 
 
 class SiameseEncoder(nn.Module):
@@ -179,13 +187,12 @@ class SiameseEncoder(nn.Module):
             goal_first = functional.embedding(goal_row, each)
         elif len(features) <= len(states):
             projected = first.project(features)
-            code = self.branch.finish(first.gather(projected, state_row), self.state_layer)
-            state = _part(heads[0](code.float()), part)
+            state = self._of_rows(first.gather(projected, state_row), heads[0], part)
             goal_first = first.gather(projected, goal_row.unsqueeze(-1).expand(-1, self.history))
         else:
             # Fewer rows than distinct frames: every frame with every place's weight would be the longer way.
             histories = functional.embedding(state_row, features)
-            state = _part(heads[0](self.branch.finish(first(histories), self.state_layer).float()), part)
+            state = self._of_rows(first(histories), heads[0], part)
             goal_first = first.repeated(functional.embedding(goal_row, features))
         goal_branch = self.branch
         if self.goal_branch is not None:
@@ -217,8 +224,17 @@ class SiameseEncoder(nn.Module):
         goal = _lookup(_part(goal_table, part), goals if goal_row is None else goal_row[goals])
         if one:
             return _lookup(_part(state_table, part), states.squeeze(-1)), goal
-        code = self.branch.finish(self.branch.first.gather(state_part, states), self.state_layer)
-        return _part(heads[0](code.float()), part), goal
+        return self._of_rows(self.branch.first.gather(state_part, states), heads[0], part), goal
+
+    def _of_rows(self, sums: Tensor, head: Head, part: int | None) -> Any:
+        """What the head makes of the codes of states, from the first layer's sums, row by row.
+
+        Where the one part that is wanted reads the leading half of the code, the other half is not computed.
+        """
+        alone = head.alone(part) if part is not None and hasattr(head, "alone") else None
+        if alone is not None:
+            return alone(self.branch.finish(sums, self.state_layer, half=True).float())
+        return _part(head(self.branch.finish(sums, self.state_layer).float()), part)
 
     def freeze(self, grad: bool = False, goals: Tensor | None = None) -> None:
         """Encodes all states of the world now; calls until :meth:`thaw` look them up. See :func:`frozen`."""
@@ -289,6 +305,10 @@ class _Normalised(NamedTuple):
     def __call__(self, embedding: Tensor) -> Any:
         return self.head(functional.layer_norm(embedding, embedding.shape[-1:]))
 
+    @property
+    def parts(self) -> int:
+        return num_parts(self.head)
+
 
 def interleaved(of_state: Any, of_goal: Any) -> tuple[Tensor, ...]:
     """``(e_s, a_s, b_s), (e_g, a_g, b_g)`` to ``e_s, e_g, a_s, b_s, a_g, b_g``: embeddings first.
@@ -299,6 +319,15 @@ def interleaved(of_state: Any, of_goal: Any) -> tuple[Tensor, ...]:
     if not isinstance(of_state, tuple):
         return of_state, of_goal
     return of_state[0], of_goal[0], *of_state[1:], *of_goal[1:]
+
+
+def num_parts(head: Head) -> int:
+    """How many tensors a head returns.
+
+    >>> num_parts(as_it_is)
+    1
+    """
+    return getattr(head, "parts", 1)
 
 
 def as_it_is(code: Tensor) -> Tensor:

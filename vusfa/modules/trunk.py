@@ -92,6 +92,10 @@ class _Fused(NamedTuple):
     def __call__(self, embedding: Tensor) -> tuple[Tensor, Tensor]:
         return embedding, getattr(self.fusion, self.part)(embedding)
 
+    @property
+    def parts(self) -> int:
+        return 2
+
 
 class SceneLayer(nn.Module):
     """A dense layer with ReLU, one a scene.
