@@ -13,6 +13,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from vusfa.errors import ConfigError
+from vusfa.modules.linear import for_autocast
 
 __all__ = ["FeatureFrames", "PictureFrames", "shrink_pictures"]
 
@@ -44,6 +45,7 @@ class FeatureFrames(nn.Module):
         table = features[:, 0].to(torch.float32).contiguous()
         self.size = table.shape[-1]
         self.normalise = normalise
+        self._converted: Tensor | None = None
         self.register_buffer("table", table if lookup else table[:0].clone(), persistent=False)
         if normalise:
             # A feature that never changes would be divided by nothing; it becomes 0 and stays out of the way.
@@ -59,8 +61,24 @@ class FeatureFrames(nn.Module):
         return len(self.table)
 
     def lookup(self, ids: Tensor | None) -> Tensor:
-        """Features (\\*B, F) of states (\\*B,) int64; of all S states in order for ``None``."""
-        return self.table if ids is None else self.table[ids]
+        """Features (\\*B, F) of states (\\*B,) int64; of all S states in order for ``None``.
+
+        Under autocast all states' come as it would convert them; that is done once, because they are
+        constants.
+        """
+        if ids is not None:
+            return self.table[ids]
+        device = self.table.device.type
+        if not torch.is_autocast_enabled(device):
+            return self.table
+        if self._converted is None or self._converted.dtype != torch.get_autocast_dtype(device):
+            self._converted = for_autocast(self.table)
+        return self._converted
+
+    def _apply(self, fn: Any, recurse: bool = True) -> Any:
+        """Every move of a module comes down to this; what was converted is converted anew."""
+        self._converted = None
+        return super()._apply(fn, recurse)
 
     def encode(self, observation: Tensor) -> Tensor:
         """Features (\\*B, F) as the encoder wants them, of features (\\*B, F) as the scene has them."""
@@ -75,6 +93,7 @@ class FeatureFrames(nn.Module):
         mean, deviation = mean.to(self.table), deviation.to(self.table)
         if not (torch.equal(mean, self.mean) and torch.equal(deviation, self.deviation)):
             self.table.copy_((self.table * self.deviation + self.mean - mean) / deviation)
+            self._converted = None
 
 
 class PictureFrames(nn.Module):

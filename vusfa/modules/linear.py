@@ -13,12 +13,30 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-__all__ = ["HistoryLinear", "SceneLinear", "SceneRows"]
+__all__ = ["Freezable", "HistoryLinear", "SceneLinear", "SceneRows", "for_autocast"]
 
 #: At most this many outputs a row are computed for nothing before rows are sorted by scene instead.
 _DENSE_OUTPUTS = 64
 #: On an accelerator sorting means waiting for it, so a few scenes are all computed there.
 _DENSE_SCENES = 8
+
+
+class Freezable(nn.Module):
+    """A module that can do beforehand what it would do at every call while its weights stand still; see
+    :func:`vusfa.modules.frozen`."""
+
+    def freeze(self, grad: bool = False, goals: Tensor | None = None) -> None:
+        """Does it now, for calls until :meth:`thaw`.
+
+        Args:
+            grad: calls with gradients are served, too; otherwise these do everything anew.
+            goals: (G,) ids of the only states that will be goals; None for all.
+        """
+        raise NotImplementedError
+
+    def thaw(self) -> None:
+        """Uses the weights as they are again."""
+        raise NotImplementedError
 
 
 class SceneRows(NamedTuple):
@@ -33,7 +51,7 @@ class SceneRows(NamedTuple):
     counts: list[int]
 
 
-class SceneLinear(nn.Module):
+class SceneLinear(Freezable):
     """An affine layer with weights of its own for each scene: row i meets those of scene ``scene_id[i]``.
 
     Batches that mix scenes are sorted by scene, so that each scene costs one matrix product of its own
@@ -126,18 +144,11 @@ class SceneLinear(nn.Module):
     def _weights(self, x: Tensor) -> tuple[Tensor, Tensor]:
         if self._frozen is not None and (self._frozen[0].requires_grad or not torch.is_grad_enabled()):
             return self._frozen
-        if not torch.is_autocast_enabled(x.device.type):
-            return self.weight, self.bias
         # In one piece: autocast would convert each scene's slice on its own.
-        dtype = torch.get_autocast_dtype(x.device.type)
-        return self.weight.to(dtype), self.bias.to(dtype)
+        return for_autocast(self.weight), for_autocast(self.bias)
 
-    def freeze(self, grad: bool = False) -> None:
-        """Converts the weights for autocast now, if it is on, for calls until :meth:`thaw`.
-
-        Args:
-            grad: the converted weights carry gradients; otherwise calls with gradients convert anew.
-        """
+    def freeze(self, grad: bool = False, goals: Tensor | None = None) -> None:
+        """Converts the weights for autocast now, if it is on; see :class:`Freezable`."""
         with torch.set_grad_enabled(grad):
             weight, bias = self._weights(self.weight)
         self._frozen = (weight, bias) if grad else (weight.detach(), bias.detach())
@@ -221,6 +232,17 @@ class HistoryLinear(nn.Module):
     def extra_repr(self) -> str:
         """What ``print`` shows of the layer."""
         return f"history={self.history}, in_features={self.in_features}, out_features={self.out_features}"
+
+
+def for_autocast(tensor: Tensor) -> Tensor:
+    """A tensor as autocast would convert it for a product, where it is on; else as it is.
+
+    >>> with torch.autocast("cpu", torch.bfloat16):
+    ...     for_autocast(torch.zeros(2)).dtype
+    torch.bfloat16
+    """
+    device = tensor.device.type
+    return tensor.to(torch.get_autocast_dtype(device)) if torch.is_autocast_enabled(device) else tensor
 
 
 def _uniform_(*tensors: Tensor, fan_in: int) -> None:

@@ -89,4 +89,4 @@ class SuccessorPolicyHead(nn.Module):
             successor = functional.rms_norm(successor, shape, eps=1e-6)
         elif self.successor_norm == "layer":
             successor = functional.layer_norm(successor, shape, eps=1e-6)
-        return successor * self.successor_gain
+        return successor if self.successor_gain == 1.0 else successor * self.successor_gain

@@ -25,7 +25,7 @@ from torch.nn import functional
 
 from vusfa.errors import ConfigError
 from vusfa.modules.frames import FeatureFrames, PictureFrames
-from vusfa.modules.linear import HistoryLinear, SceneLinear
+from vusfa.modules.linear import Freezable, HistoryLinear, for_autocast
 
 __all__ = ["Branch", "Head", "Heads", "NormalisedEncoder", "SiameseEncoder", "frozen"]
 
@@ -51,6 +51,7 @@ class Branch(nn.Module):
         super().__init__()
         self.first = HistoryLinear(history, in_features, hidden_size)
         self.last = None if out_features is None else nn.Linear(hidden_size, out_features)
+        self._frozen: tuple[Tensor, Tensor] | None = None
 
     def finish(self, first: Tensor, extra: nn.Module | None = None, *, half: bool = False) -> Tensor:
         """What follows the first layer's sums (\\*B, hidden_size): ReLU, ``extra`` with ReLU, last layer; of
@@ -60,13 +61,30 @@ class Branch(nn.Module):
             code = functional.relu(extra(code))
         if self.last is None:
             return code
-        if half:
-            outputs = self.last.out_features // 2
-            return functional.linear(code, self.last.weight[:outputs], self.last.bias[:outputs])
-        return self.last(code)
+        if not half:
+            return self.last(code)
+        if self._frozen is not None and not torch.is_grad_enabled():
+            return functional.linear(code, *self._frozen)
+        return functional.linear(code, *self._half(self.last))
+
+    @staticmethod
+    def _half(last: nn.Linear) -> tuple[Tensor, Tensor]:
+        outputs = last.out_features // 2
+        return last.weight[:outputs], last.bias[:outputs]
+
+    def freeze(self) -> None:
+        """Converts half the last layer for autocast now, for calls without gradients until :meth:`thaw`:
+        autocast would convert a part of a weight at every call."""
+        if self.last is not None:
+            weight, bias = self._half(self.last)
+            self._frozen = for_autocast(weight.detach()), for_autocast(bias.detach())
+
+    def thaw(self) -> None:
+        """Uses the weights as they are again."""
+        self._frozen = None
 
 
-class SiameseEncoder(nn.Module):
+class SiameseEncoder(Freezable):
     """Embeds the state (its last H frames) and the goal (its one frame, in all H places).
 
     Args:
@@ -254,10 +272,12 @@ class SiameseEncoder(nn.Module):
                 features = features[goals]
             goal_codes = goal_branch.finish(goal_branch.first.repeated(features)).float()
         self._frozen = state_part, goal_codes, row
+        self.branch.freeze()
 
     def thaw(self) -> None:
         """Encodes with the weights as they are again."""
         self._frozen = None
+        self.branch.thaw()
         self._frozen_heads = {}
 
     def _check_history(self, frames: int, key: str) -> None:
@@ -355,8 +375,8 @@ def _lookup(table: Any, index: Tensor) -> Any:
 
 @contextmanager
 def frozen(module: nn.Module, grad: bool = False, goals: Tensor | None = None) -> Iterator[None]:
-    """Within it, every siamese encoder in ``module`` looks up what it encoded on the way in, and scenes'
-    weights are converted for autocast once.
+    """Within it, every siamese encoder in ``module`` looks up what it encoded on the way in, and weights that
+    autocast would convert at every call are converted once.
 
     The weights must not change meanwhile. Other modules are left as they are, so any policy may be passed.
 
@@ -374,10 +394,10 @@ def frozen(module: nn.Module, grad: bool = False, goals: Tensor | None = None) -
     >>> with frozen(agent), torch.no_grad():
     ...     state, goal = agent.encoder(torch.zeros(3, 4, dtype=torch.int64), torch.arange(3))
     """
-    parts = [part for part in module.modules() if isinstance(part, SiameseEncoder | SceneLinear)]
+    parts = [part for part in module.modules() if isinstance(part, Freezable)]
     try:
         for part in parts:
-            part.freeze(grad, goals) if isinstance(part, SiameseEncoder) else part.freeze(grad)
+            part.freeze(grad, goals)
         yield
     finally:
         for part in parts:

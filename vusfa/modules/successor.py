@@ -36,7 +36,8 @@ class SuccessorHead(nn.Module):
 
     def forward(self, hidden: Tensor, scene_id: Tensor | SceneRows) -> Tensor:
         """(\\*B, hidden_size) with scene indices (\\*B,) to (\\*B, E) float32."""
-        return self.scale * self.linear(hidden, scene_id).float()
+        successor = self.linear(hidden, scene_id).float()  # nobody else's: scaled where it lies
+        return successor if self.scale == 1.0 else successor.mul_(self.scale)
 
 
 class RewardHead(nn.Module):

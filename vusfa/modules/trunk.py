@@ -4,15 +4,16 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
+import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from vusfa.modules.linear import SceneLinear, SceneRows
+from vusfa.modules.linear import Freezable, SceneLinear, SceneRows, for_autocast
 
 __all__ = ["Fusion", "SceneLayer", "SiameseTrunk"]
 
 
-class Fusion(nn.Module):
+class Fusion(Freezable):
     """Lays the embeddings of state and goal end to end; a dense layer with ReLU, shared by all scenes.
 
     Args:
@@ -27,6 +28,7 @@ class Fusion(nn.Module):
     def __init__(self, embedding_size: int, hidden_size: int) -> None:
         super().__init__()
         self.linear = nn.Linear(2 * embedding_size, hidden_size)
+        self._frozen: Tensor | None = None
 
     def forward(self, state_embedding: Tensor, goal_embedding: Tensor) -> Tensor:
         """(\\*B, E) twice to (\\*B, hidden_size)."""
@@ -35,12 +37,24 @@ class Fusion(nn.Module):
     def state_part(self, embedding: Tensor) -> Tensor:
         """What the state's embedding (\\*B, E) adds to the layer's sums, (\\*B, hidden_size); without the
         bias."""
+        if self._frozen is not None and not torch.is_grad_enabled():
+            return functional.linear(embedding, self._frozen)
         return functional.linear(embedding, self.linear.weight[:, : embedding.shape[-1]])
 
     def goal_part(self, embedding: Tensor) -> Tensor:
         """What the goal's embedding (\\*B, E) adds to them, and the bias, (\\*B, hidden_size)."""
         weight = self.linear.weight[:, -embedding.shape[-1] :]
         return functional.linear(embedding, weight, self.linear.bias)
+
+    def freeze(self, grad: bool = False, goals: Tensor | None = None) -> None:
+        """Converts the state's part of the weights for autocast now, for calls without gradients; autocast
+        would convert a part of a weight at every call. See :class:`~vusfa.modules.linear.Freezable`."""
+        part = self.linear.weight.detach()[:, : self.linear.in_features // 2]
+        self._frozen = for_autocast(part).contiguous()
+
+    def thaw(self) -> None:
+        """Uses the weights as they are again."""
+        self._frozen = None
 
 
 class SiameseTrunk(nn.Module):
