@@ -47,15 +47,38 @@ def test_the_best_on_the_validation_goals_is_chosen(rooms: SceneSet, monkeypatch
     manifest = manifest_for(rooms, torch.tensor([3]))
     start, goal = manifest.episodes(rooms, validation=True)
 
-    def walked(*arguments: object, validation: bool) -> object:
+    def walked(*arguments: object, validation: bool, autocast: bool = False) -> object:
         assert validation
+        assert not autocast  # one frame
         steps = {"a": 9, "b": 499, "c": 499}[str(arguments[4])]  # of most steps, more succeed
         policy = agent.get_policy_operator()
         return evaluate(policy, rooms, episodes=(start, goal), max_steps=steps, history=1)
 
+    state = {"goals": torch.tensor([3]), "config": {"autocast": True}}
     monkeypatch.setattr(cells, "walk_manifest", walked)
-    monkeypatch.setattr(cells, "load_agent", lambda path: (agent, rooms, {"goals": torch.tensor([3])}))
+    monkeypatch.setattr(cells, "load_agent", lambda path: (agent, rooms, state))
     scores = choose_checkpoint([Path("a.pt"), Path("b.pt"), Path("c.pt")])
     assert [path.stem for path in scores] == ["b", "c", "a"]
     table = walked(*[None] * 4, "b", validation=True)
     assert scores[Path("b.pt")] == spl(table.success, table.length, table.shortest)  # type: ignore[attr-defined]
+
+
+def test_a_walk_in_the_precision_of_the_training(rooms: SceneSet) -> None:
+    """Products in bfloat16 change the logits a little, and which of two likely actions is drawn now and
+    then."""
+    torch.manual_seed(0)
+    agent = make_agent("vusfa", scenes=rooms, history=4, hidden_size=32, embedding_size=32)
+    with torch.no_grad():  # an untrained policy is nearly uniform: let it prefer something
+        for parameter in agent.policy.parameters():
+            parameter.mul_(4.0)
+    manifest, trained = manifest_for(rooms, torch.tensor([3])), torch.tensor([3])
+    dtypes: list[torch.dtype] = []
+    agent.scene_layer.register_forward_hook(lambda module, given, made: dtypes.append(made.dtype))
+    tables = [
+        walk_manifest(agent, rooms, manifest, trained, "", validation=True, autocast=on)
+        for on in (False, True)
+    ]
+    assert set(dtypes) == {torch.float32, torch.bfloat16}
+    success = [table.success.double().mean().item() for table in tables]
+    assert success[0] == pytest.approx(success[1], abs=0.25)
+    assert not tables[0].equal(tables[1])

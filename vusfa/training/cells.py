@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import torch
 from tensordict.nn import TensorDictModuleBase
@@ -14,7 +15,7 @@ from vusfa.evaluation.manifest import BUNDLED_MANIFEST, Manifest, make_manifest,
 from vusfa.evaluation.metrics import spl
 from vusfa.evaluation.results import Cell
 from vusfa.evaluation.tabulated import TabulatedPolicy
-from vusfa.modules import Agent, sees_one_frame
+from vusfa.modules import ActingPolicy, Agent, sees_one_frame
 from vusfa.scenes import SceneSet
 from vusfa.training.facts import run_facts
 from vusfa.training.progress import EvaluationProgress
@@ -47,7 +48,15 @@ def choose_checkpoint(checkpoints: Sequence[Path], manifest: Path | None = None)
     for path in checkpoints:
         agent, scenes, state = load_agent(path)
         episodes = manifest_for(scenes, state["goals"], manifest)
-        table = walk_manifest(agent, scenes, episodes, state["goals"], path.stem, validation=True)
+        table = walk_manifest(
+            agent,
+            scenes,
+            episodes,
+            state["goals"],
+            path.stem,
+            validation=True,
+            autocast=_autocast(agent, state),
+        )
         scores[path] = spl(table.success, table.length, table.shortest)
     return dict(sorted(scores.items(), key=lambda item: -item[1]))
 
@@ -68,7 +77,16 @@ def measure_checkpoint(
     episodes, trained = manifest_for(scenes, state["goals"], manifest), state["goals"]
     table = TabulatedPolicy(agent, scenes) if sees_one_frame(agent) else None
     tables = {
-        way: walk_manifest(agent, scenes, episodes, trained, f"{name}, {way}", way == "sampled", policy=table)
+        way: walk_manifest(
+            agent,
+            scenes,
+            episodes,
+            trained,
+            f"{name}, {way}",
+            way == "sampled",
+            policy=table,
+            autocast=_autocast(agent, state),
+        )
         for way in WAYS
     }
     exact = None if table is None else exact_goals(table.probabilities, scenes)
@@ -85,6 +103,7 @@ def walk_manifest(
     sample: bool = True,
     validation: bool = False,
     policy: TensorDictModuleBase | None = None,
+    autocast: bool = False,
 ) -> Episodes:
     """A manifest's episodes, walked by an agent.
 
@@ -96,8 +115,12 @@ def walk_manifest(
         sample: draw actions, or take the likeliest.
         validation: walk the episodes that checkpoints are chosen by, instead of those to report.
         policy: what acts for the agent; its actor when not given.
+        autocast: compute in bfloat16 where that is safe, as a training with ``autocast=true`` does.
     """
-    with EvaluationProgress() as progress:
+    if policy is None and agent.memory is None:
+        policy = ActingPolicy(agent)  # the same actions
+    device = scenes.successor.device.type
+    with EvaluationProgress() as progress, torch.autocast(device, torch.bfloat16, enabled=autocast):
         return evaluate(
             agent.get_policy_operator(out_keys=["action"]) if policy is None else policy,
             scenes,
@@ -109,3 +132,9 @@ def walk_manifest(
             observe=make_observation(agent, scenes),
             progress=lambda done, total: progress(title, done, total),
         )
+
+
+def _autocast(agent: Agent, state: Mapping[str, Any]) -> bool:
+    """Whether an evaluation computes in bfloat16: as the agent was trained, where it walks every episode. What
+    is little work, as with one frame, is done in float32."""
+    return bool(state["config"]["autocast"]) and not sees_one_frame(agent)
