@@ -135,6 +135,6 @@ def walk_manifest(
 
 
 def _autocast(agent: Agent, state: Mapping[str, Any]) -> bool:
-    """Whether an evaluation computes in bfloat16: as the agent was trained, where it walks every episode. What
+    """Whether an evaluation computes in bfloat16: as the agent was trained, where it walks each episode. What
     is little work, as with one frame, is done in float32."""
     return bool(state["config"]["autocast"]) and not sees_one_frame(agent)
