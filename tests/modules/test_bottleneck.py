@@ -6,7 +6,7 @@ from tensordict import TensorDict
 
 from vusfa.errors import ConfigError
 from vusfa.modules import FeatureFrames, GaussianEncoder, LatentSampler, SiameseEncoder, make_agent
-from vusfa.modules.siamese import NormalisedEncoder
+from vusfa.modules.normalised import NormalisedEncoder
 from vusfa.modules.trunk import Fusion, SiameseTrunk
 from vusfa.scenes import SceneSet
 

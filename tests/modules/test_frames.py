@@ -35,6 +35,20 @@ class TestFeatureFrames:
         loaded.load_state_dict(trained.state_dict())
         torch.testing.assert_close(loaded.encode(scenes.features[:, 0]), trained.lookup(None))
 
+    def test_autocast_gets_the_table_converted_once(self, scenes: SceneSet) -> None:
+        frames = FeatureFrames(scenes.features, normalise=True)
+        other = FeatureFrames(scenes.features * 3 + 1, normalise=True)
+        with torch.autocast("cpu", torch.bfloat16):
+            table = frames.lookup(None)
+            assert torch.equal(table, frames.table.bfloat16())
+            assert frames.lookup(None) is table
+            frames.load_state_dict(other.state_dict())
+            assert torch.equal(frames.lookup(None), frames.table.bfloat16())
+            assert not torch.equal(frames.lookup(None), table)
+            frames.double()
+            assert torch.equal(frames.lookup(None), frames.table.bfloat16())
+        assert frames.lookup(None) is frames.table
+
     def test_a_constant_feature_becomes_nothing(self) -> None:
         features = torch.rand(5, 1, 3)
         features[..., 1] = 0.7

@@ -13,11 +13,13 @@ from vusfa.modules.autoencoder import explained_features, pretrain_autoencoder
 from vusfa.modules.bottleneck import GaussianEncoder, LatentSampler
 from vusfa.modules.episodic import TriedActions
 from vusfa.modules.frames import FeatureFrames, PictureFrames
+from vusfa.modules.freezing import frozen
 from vusfa.modules.linear import HistoryLinear, SceneLinear
+from vusfa.modules.normalised import NormalisedEncoder
 from vusfa.modules.pairs import StateGoalPairs, sees_one_frame
 from vusfa.modules.policy import PolicyHead, SuccessorPolicyHead
 from vusfa.modules.presets import MODELS, PRESETS, AgentConfig, resolve_config
-from vusfa.modules.siamese import NormalisedEncoder, SiameseEncoder, frozen
+from vusfa.modules.siamese import SiameseEncoder
 from vusfa.modules.successor import RewardHead, SuccessorHead, SuccessorValue, ValueHead
 from vusfa.modules.trunk import Fusion, SceneLayer
 

@@ -30,9 +30,10 @@ from torchrl.modules import LSTMModule
 from vusfa.errors import ConfigError
 from vusfa.modules.bottleneck import GaussianEncoder, LatentSampler
 from vusfa.modules.frames import FeatureFrames, PictureFrames, picture_table
+from vusfa.modules.normalised import NormalisedEncoder
 from vusfa.modules.policy import PolicyHead, SuccessorPolicyHead
 from vusfa.modules.presets import AgentConfig, resolve_config
-from vusfa.modules.siamese import NormalisedEncoder, SiameseEncoder
+from vusfa.modules.siamese import SiameseEncoder
 from vusfa.modules.successor import RewardHead, SuccessorHead, SuccessorValue, ValueHead
 from vusfa.modules.trunk import Fusion, SceneLayer, SiameseTrunk
 

@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from vusfa.errors import ConfigError
-from vusfa.modules.linear import for_autocast
+from vusfa.modules.freezing import for_autocast
 
 __all__ = ["FeatureFrames", "PictureFrames", "shrink_pictures"]
 

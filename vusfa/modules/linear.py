@@ -13,30 +13,14 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-__all__ = ["Freezable", "HistoryLinear", "SceneLinear", "SceneRows", "for_autocast"]
+from vusfa.modules.freezing import Freezable, for_autocast
+
+__all__ = ["HistoryLinear", "SceneLinear", "SceneRows"]
 
 #: At most this many outputs a row are computed for nothing before rows are sorted by scene instead.
 _DENSE_OUTPUTS = 64
 #: On an accelerator sorting means waiting for it, so a few scenes are all computed there.
 _DENSE_SCENES = 8
-
-
-class Freezable(nn.Module):
-    """A module that can do beforehand what it would do at every call while its weights stand still; see
-    :func:`vusfa.modules.frozen`."""
-
-    def freeze(self, grad: bool = False, goals: Tensor | None = None) -> None:
-        """Does it now, for calls until :meth:`thaw`.
-
-        Args:
-            grad: calls with gradients are served, too; otherwise these do everything anew.
-            goals: (G,) ids of the only states that will be goals; None for all.
-        """
-        raise NotImplementedError
-
-    def thaw(self) -> None:
-        """Uses the weights as they are again."""
-        raise NotImplementedError
 
 
 class SceneRows(NamedTuple):
@@ -148,7 +132,7 @@ class SceneLinear(Freezable):
         return for_autocast(self.weight), for_autocast(self.bias)
 
     def freeze(self, grad: bool = False, goals: Tensor | None = None) -> None:
-        """Converts the weights for autocast now, if it is on; see :class:`Freezable`."""
+        """Converts the weights for autocast now, if it is on."""
         with torch.set_grad_enabled(grad):
             weight, bias = self._weights(self.weight)
         self._frozen = (weight, bias) if grad else (weight.detach(), bias.detach())
@@ -232,17 +216,6 @@ class HistoryLinear(nn.Module):
     def extra_repr(self) -> str:
         """What ``print`` shows of the layer."""
         return f"history={self.history}, in_features={self.in_features}, out_features={self.out_features}"
-
-
-def for_autocast(tensor: Tensor) -> Tensor:
-    """A tensor as autocast would convert it for a product, where it is on; else as it is.
-
-    >>> with torch.autocast("cpu", torch.bfloat16):
-    ...     for_autocast(torch.zeros(2)).dtype
-    torch.bfloat16
-    """
-    device = tensor.device.type
-    return tensor.to(torch.get_autocast_dtype(device)) if torch.is_autocast_enabled(device) else tensor
 
 
 def _uniform_(*tensors: Tensor, fan_in: int) -> None:

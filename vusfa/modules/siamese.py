@@ -15,9 +15,8 @@ batch once:
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from typing import Any, NamedTuple
+from collections.abc import Callable
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -25,9 +24,10 @@ from torch.nn import functional
 
 from vusfa.errors import ConfigError
 from vusfa.modules.frames import FeatureFrames, PictureFrames
-from vusfa.modules.linear import Freezable, HistoryLinear, for_autocast
+from vusfa.modules.freezing import Freezable, for_autocast
+from vusfa.modules.linear import HistoryLinear
 
-__all__ = ["Branch", "Head", "Heads", "NormalisedEncoder", "SiameseEncoder", "frozen"]
+__all__ = ["Branch", "Head", "Heads", "SiameseEncoder", "as_it_is", "interleaved", "num_parts"]
 
 #: What follows the encoder row by row: codes (D, out) to one or several tensors of D rows. One for states and
 #: one for goals; hashable, and equal where they do the same. A head may have a method ``alone``: of a part's
@@ -255,7 +255,7 @@ class SiameseEncoder(Freezable):
         return _part(head(self.branch.finish(sums, self.state_layer).float()), part)
 
     def freeze(self, grad: bool = False, goals: Tensor | None = None) -> None:
-        """Encodes all states of the world now; calls until :meth:`thaw` look them up. See :func:`frozen`."""
+        """Encodes all states of the world now; calls until :meth:`thaw` look them up."""
         if not self.by_id:
             return
         with torch.set_grad_enabled(grad):
@@ -286,48 +286,6 @@ class SiameseEncoder(Freezable):
                 f"{key} has {frames} frames a row and the agent reads {self.history};"
                 f" give the environment history={self.history}, or the agent history={frames}"
             )
-
-
-class NormalisedEncoder(nn.Module):
-    """An encoder whose two embeddings are brought to mean 0 and deviation 1 over their E dimensions.
-
-    phi is then of one size whatever the weights do. Without it, phi, psi and V = psi . omega can drive each
-    other up without bound; with a bottleneck, pi and psi go on reading full-sized means while the KL term
-    presses the means that omega's sample is made of towards 0. What else the encoder returns (the Gaussians'
-    means and scales) passes as it is.
-
-    Args:
-        encoder: returns the two embeddings first, (\\*B, E) each.
-
-    >>> from vusfa.modules.frames import FeatureFrames
-    >>> encoder = SiameseEncoder(FeatureFrames(torch.rand(12, 1, 8)), 1, hidden_size=16, out_features=6)
-    >>> state, goal = NormalisedEncoder(encoder)(torch.tensor([[3], [5]]), torch.tensor([7, 7]))
-    >>> bool((state.mean(-1).abs() < 1e-6).all()), bool((goal.std(-1, correction=0) - 1 < 1e-4).all())
-    (True, True)
-    """
-
-    def __init__(self, encoder: Any) -> None:
-        super().__init__()
-        self.encoder = encoder
-
-    def forward(self, state: Tensor, goal: Tensor) -> tuple[Tensor, ...]:
-        """Both embeddings, and what else the encoder returns."""
-        return interleaved(*self.both(state, goal, (as_it_is, as_it_is)))
-
-    def both(self, state: Tensor, goal: Tensor, heads: Heads, part: int | None = None) -> tuple[Any, Any]:
-        """What the heads make of the normalised embeddings, and what else it returns; or one part."""
-        return self.encoder.both(state, goal, (_Normalised(heads[0]), _Normalised(heads[1])), part)
-
-
-class _Normalised(NamedTuple):
-    head: Head
-
-    def __call__(self, embedding: Tensor) -> Any:
-        return self.head(functional.layer_norm(embedding, embedding.shape[-1:]))
-
-    @property
-    def parts(self) -> int:
-        return num_parts(self.head)
 
 
 def interleaved(of_state: Any, of_goal: Any) -> tuple[Tensor, ...]:
@@ -371,34 +329,3 @@ def _part(made: Any, part: int | None) -> Any:
 
 def _lookup(table: Any, index: Tensor) -> Any:
     return _map(table, lambda part: functional.embedding(index, part))
-
-
-@contextmanager
-def frozen(module: nn.Module, grad: bool = False, goals: Tensor | None = None) -> Iterator[None]:
-    """Within it, every siamese encoder in ``module`` looks up what it encoded on the way in, and weights that
-    autocast would convert at every call are converted once.
-
-    The weights must not change meanwhile. Other modules are left as they are, so any policy may be passed.
-
-    Args:
-        module: an agent, or any part of one.
-        grad: what is looked up carries gradients to the weights, where gradients are on: for an update, which
-            then encodes the world once for collecting and for the loss. Otherwise calls with gradients encode
-            anew.
-        goals: (G,) ids of the only states that will be goals, which are then the only ones to be encoded as
-            such; None for all of the world.
-
-    >>> from vusfa.modules import make_agent
-    >>> from vusfa.scenes import SceneSet
-    >>> agent = make_agent("usfa", scenes=SceneSet.bundled(["bathroom"]))
-    >>> with frozen(agent), torch.no_grad():
-    ...     state, goal = agent.encoder(torch.zeros(3, 4, dtype=torch.int64), torch.arange(3))
-    """
-    parts = [part for part in module.modules() if isinstance(part, Freezable)]
-    try:
-        for part in parts:
-            part.freeze(grad, goals)
-        yield
-    finally:
-        for part in parts:
-            part.thaw()

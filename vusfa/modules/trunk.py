@@ -8,7 +8,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from vusfa.modules.linear import Freezable, SceneLinear, SceneRows, for_autocast
+from vusfa.modules.freezing import Freezable, for_autocast
+from vusfa.modules.linear import SceneLinear, SceneRows
 
 __all__ = ["Fusion", "SceneLayer", "SiameseTrunk"]
 
@@ -48,7 +49,7 @@ class Fusion(Freezable):
 
     def freeze(self, grad: bool = False, goals: Tensor | None = None) -> None:
         """Converts the state's part of the weights for autocast now, for calls without gradients; autocast
-        would convert a part of a weight at every call. See :class:`~vusfa.modules.linear.Freezable`."""
+        would convert a part of a weight at every call."""
         part = self.linear.weight.detach()[:, : self.linear.in_features // 2]
         self._frozen = for_autocast(part).contiguous()
 
