@@ -12,6 +12,7 @@ from vusfa.envs import resolve_goals
 from vusfa.evaluation import evaluate
 from vusfa.modules import ActingPolicy, make_agent
 from vusfa.scenes import SceneSet
+from vusfa.training.cells import evaluation_policy, evaluation_precision
 
 __all__ = ["run"]
 
@@ -19,7 +20,7 @@ MINUTES = 2.0
 
 
 def run(options: Options) -> Report:
-    """Untrained VUSFA agents, which wander for most of the 500 steps: trained ones take less time.
+    """Untrained VUSFA agents, which wander for most of the 500 steps, as recipes/zero_shot.py evaluates them.
 
     One as the recipe builds it, and one of four frames with layers of 512, as preset=controlled has it.
     """
@@ -36,28 +37,28 @@ def run(options: Options) -> Report:
 def _measure(name: str, scenes: SceneSet, history: int, size: int, options: Options, report: Report) -> None:
     torch.manual_seed(0)
     agent = make_agent("vusfa", scenes=scenes, history=history, hidden_size=size, embedding_size=size)
-    actor = ActingPolicy(agent)
     goals = resolve_goals(scenes, "all")
     each, limit = (1, 10) if options.quick else (10, 500)
     chosen = goals[:8] if options.quick else goals
 
-    def seconds(some: torch.Tensor, batch: int, episodes: int) -> float:
+    def seconds(some: torch.Tensor, batch: int, episodes: int, together: bool = False) -> float:
         began = time.perf_counter()
-        evaluate(
-            actor,
-            scenes,
-            some,
-            episodes_per_goal=episodes,
-            max_steps=limit,
-            batch_size=batch,
-            history=history,
-        )
+        with evaluation_precision(agent, {"autocast": True}):
+            evaluate(
+                evaluation_policy(agent, scenes) if together else ActingPolicy(agent),
+                scenes,
+                some,
+                episodes_per_goal=episodes,
+                max_steps=limit,
+                batch_size=batch,
+                history=history,
+            )
         return time.perf_counter() - began
 
     seconds(goals[:2], 16, 1)  # unmeasured
     sample = goals[:: max(1, len(goals) // 8)][:8]
     alone = seconds(sample, 1, 1) / len(sample) * len(chosen) * each
-    whole = seconds(chosen, 4096, each)
+    whole = seconds(chosen, 4096, each, together=True)
     again = seconds(sample, 1, 1) / len(sample) * len(chosen) * each
     alone = (alone + again) / 2
     label = f"zero-shot evaluation, {name}, {len(chosen):,} goals, {each} episodes each"

@@ -19,8 +19,6 @@ from vusfa.errors import VusfaError
 from vusfa.evaluation import compare, print_summary
 from vusfa.evaluation.files import check_folder
 from vusfa.evaluation.manifest import BUNDLED_MANIFEST, read_manifest
-from vusfa.evaluation.tabulated import TabulatedPolicy
-from vusfa.modules import sees_one_frame
 from vusfa.training import (
     EvaluationProgress,
     load_agent,
@@ -29,6 +27,7 @@ from vusfa.training import (
     row_name,
     set_threads,
 )
+from vusfa.training.cells import evaluation_policy, evaluation_precision
 
 
 def zero_shot(
@@ -73,14 +72,10 @@ def zero_shot(
     torch.manual_seed(seed)
     untrained = rebuild_agent(agent.config, scenes).to(device)
     policies = {row_name(state["config"]): agent, "untrained": untrained}
-    with EvaluationProgress() as progress:
+    every = scenes if goals == "all" else None
+    with EvaluationProgress() as progress, evaluation_precision(agent, state["config"]):
         result = compare(
-            {
-                name: TabulatedPolicy(policy, scenes)
-                if sees_one_frame(policy) and goals == "all"
-                else policy.get_policy_operator()
-                for name, policy in policies.items()
-            },
+            {name: evaluation_policy(policy, every) for name, policy in policies.items()},
             scenes,
             goals,
             trained=state["goals"],

@@ -11,7 +11,7 @@ from vusfa.evaluation.metrics import spl
 from vusfa.modules import make_agent
 from vusfa.scenes import SceneSet
 from vusfa.training import cells
-from vusfa.training.cells import choose_checkpoint, manifest_for, walk_manifest
+from vusfa.training.cells import choose_checkpoint, evaluation_precision, manifest_for, walk_manifest
 
 
 @pytest.fixture
@@ -47,9 +47,9 @@ def test_the_best_on_the_validation_goals_is_chosen(rooms: SceneSet, monkeypatch
     manifest = manifest_for(rooms, torch.tensor([3]))
     start, goal = manifest.episodes(rooms, validation=True)
 
-    def walked(*arguments: object, validation: bool, autocast: bool = False) -> object:
+    def walked(*arguments: object, validation: bool, policy: object = None) -> object:
         assert validation
-        assert not autocast  # one frame
+        assert not torch.is_autocast_enabled("cpu")  # one frame
         steps = {"a": 9, "b": 499, "c": 499}[str(arguments[4])]  # of most steps, more succeed
         policy = agent.get_policy_operator()
         return evaluate(policy, rooms, episodes=(start, goal), max_steps=steps, history=1)
@@ -74,10 +74,10 @@ def test_a_walk_in_the_precision_of_the_training(rooms: SceneSet) -> None:
     manifest, trained = manifest_for(rooms, torch.tensor([3])), torch.tensor([3])
     dtypes: list[torch.dtype] = []
     agent.scene_layer.register_forward_hook(lambda module, given, made: dtypes.append(made.dtype))
-    tables = [
-        walk_manifest(agent, rooms, manifest, trained, "", validation=True, autocast=on)
-        for on in (False, True)
-    ]
+    tables = []
+    for on in (False, True):
+        with evaluation_precision(agent, {"autocast": on}):
+            tables.append(walk_manifest(agent, rooms, manifest, trained, "", validation=True))
     assert set(dtypes) == {torch.float32, torch.bfloat16}
     success = [table.success.double().mean().item() for table in tables]
     assert success[0] == pytest.approx(success[1], abs=0.25)

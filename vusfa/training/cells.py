@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +22,14 @@ from vusfa.training.facts import run_facts
 from vusfa.training.progress import EvaluationProgress
 from vusfa.training.session import load_agent, make_observation
 
-__all__ = ["choose_checkpoint", "manifest_for", "measure_checkpoint", "walk_manifest"]
+__all__ = [
+    "choose_checkpoint",
+    "evaluation_policy",
+    "evaluation_precision",
+    "manifest_for",
+    "measure_checkpoint",
+    "walk_manifest",
+]
 
 WAYS = ("sampled", "greedy")
 
@@ -48,17 +56,44 @@ def choose_checkpoint(checkpoints: Sequence[Path], manifest: Path | None = None)
     for path in checkpoints:
         agent, scenes, state = load_agent(path)
         episodes = manifest_for(scenes, state["goals"], manifest)
-        table = walk_manifest(
-            agent,
-            scenes,
-            episodes,
-            state["goals"],
-            path.stem,
-            validation=True,
-            autocast=_autocast(agent, state),
-        )
+        policy = evaluation_policy(agent)  # goals are few: no table of all of them
+        with evaluation_precision(agent, state["config"]):
+            table = walk_manifest(
+                agent, scenes, episodes, state["goals"], path.stem, validation=True, policy=policy
+            )
         scores[path] = spl(table.success, table.length, table.shortest)
     return dict(sorted(scores.items(), key=lambda item: -item[1]))
+
+
+def evaluation_policy(agent: Agent, scenes: SceneSet | None = None) -> TensorDictModuleBase:
+    """What acts for an agent in an evaluation: the same actions as its actor's, for less.
+
+    Args:
+        agent: as it now is.
+        scenes: where every state is going to be a goal; an agent of one frame is then written down as a
+            table.
+
+    >>> from vusfa.modules import make_agent
+    >>> rooms = SceneSet.bundled(["bathroom"])
+    >>> agent = make_agent("gvf", scenes=rooms, history=1, hidden_size=8)
+    >>> type(evaluation_policy(agent)).__name__, type(evaluation_policy(agent, rooms)).__name__
+    ('ActingPolicy', 'TabulatedPolicy')
+    """
+    if scenes is not None and sees_one_frame(agent):
+        return TabulatedPolicy(agent, scenes)
+    return ActingPolicy(agent) if agent.memory is None else agent.get_policy_operator(out_keys=["action"])
+
+
+def evaluation_precision(agent: Agent, config: Mapping[str, Any]) -> AbstractContextManager[Any]:
+    """The context to evaluate in: products in bfloat16 for an agent that was trained with ``autocast=true``
+    and sees several frames, whose every step has to be computed; float32 for any other.
+
+    Args:
+        agent: of the checkpoint.
+        config: the checkpoint's settings.
+    """
+    on = bool(config["autocast"]) and not sees_one_frame(agent)
+    return torch.autocast(next(agent.parameters()).device.type, torch.bfloat16, enabled=on)
 
 
 def measure_checkpoint(
@@ -75,21 +110,15 @@ def measure_checkpoint(
     """
     agent, scenes, state = load_agent(checkpoint)
     episodes, trained = manifest_for(scenes, state["goals"], manifest), state["goals"]
-    table = TabulatedPolicy(agent, scenes) if sees_one_frame(agent) else None
-    tables = {
-        way: walk_manifest(
-            agent,
-            scenes,
-            episodes,
-            trained,
-            f"{name}, {way}",
-            way == "sampled",
-            policy=table,
-            autocast=_autocast(agent, state),
-        )
-        for way in WAYS
-    }
-    exact = None if table is None else exact_goals(table.probabilities, scenes)
+    policy = evaluation_policy(agent, scenes)
+    with evaluation_precision(agent, state["config"]):
+        tables = {
+            way: walk_manifest(
+                agent, scenes, episodes, trained, f"{name}, {way}", way == "sampled", policy=policy
+            )
+            for way in WAYS
+        }
+    exact = exact_goals(policy.probabilities, scenes) if isinstance(policy, TabulatedPolicy) else None
     info = {**run_facts(state, overrides), "checkpoint": checkpoint.name}
     return Cell(experiment, name, info, tables, exact)
 
@@ -103,7 +132,6 @@ def walk_manifest(
     sample: bool = True,
     validation: bool = False,
     policy: TensorDictModuleBase | None = None,
-    autocast: bool = False,
 ) -> Episodes:
     """A manifest's episodes, walked by an agent.
 
@@ -115,14 +143,10 @@ def walk_manifest(
         sample: draw actions, or take the likeliest.
         validation: walk the episodes that checkpoints are chosen by, instead of those to report.
         policy: what acts for the agent; its actor when not given.
-        autocast: compute in bfloat16 where that is safe, as a training with ``autocast=true`` does.
     """
-    if policy is None and agent.memory is None:
-        policy = ActingPolicy(agent)  # the same actions
-    device = scenes.successor.device.type
-    with EvaluationProgress() as progress, torch.autocast(device, torch.bfloat16, enabled=autocast):
+    with EvaluationProgress() as progress:
         return evaluate(
-            agent.get_policy_operator(out_keys=["action"]) if policy is None else policy,
+            evaluation_policy(agent) if policy is None else policy,
             scenes,
             episodes=manifest.episodes(scenes, validation),
             trained=trained,
@@ -132,9 +156,3 @@ def walk_manifest(
             observe=make_observation(agent, scenes),
             progress=lambda done, total: progress(title, done, total),
         )
-
-
-def _autocast(agent: Agent, state: Mapping[str, Any]) -> bool:
-    """Whether an evaluation computes in bfloat16: as the agent was trained, where it walks each episode. What
-    is little work, as with one frame, is done in float32."""
-    return bool(state["config"]["autocast"]) and not sees_one_frame(agent)
