@@ -1,6 +1,6 @@
 """Collection with the VUSFA agent (4 frames, 4 rooms) beside a bare loop, and fed with features.
 
-With the recipe's number of environments, and with 256 and 1024: a step of few rows is mostly calls.
+With the recipe's 256 environments, with fewer and with more: a step of few rows is mostly calls.
 """
 
 from __future__ import annotations

@@ -30,7 +30,7 @@ __all__ = ["PEERS", "Outcome", "checker", "is_solved", "run", "solve_row", "trai
 PEERS: dict[str, dict[str, Any]] = {
     "A2C": {
         "n_steps": 50,
-        "learning_rate": 5e-4,
+        "learning_rate": 1e-3,
         "ent_coef": 0.005,
         "use_rms_prop": False,
         "normalize_advantage": True,
