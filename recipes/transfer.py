@@ -20,7 +20,7 @@ from rich.progress import track
 from vusfa.errors import CheckpointError, VusfaError
 from vusfa.evaluation.results import Cell, read_cell, read_cells, write_cell
 from vusfa.evaluation.transfer import KINDS, new_goals, walked_lengths
-from vusfa.evaluation.transfer_figure import draw_transfer, transfer_table
+from vusfa.evaluation.transfer_figure import difference_table, draw_transfer, transfer_table
 from vusfa.modules.presets import MODELS
 from vusfa.scenes import SceneSet
 from vusfa.training import load_agent, run_facts, set_threads
@@ -33,8 +33,8 @@ def run(
     seeds: list[int] = [0, 1, 2, 3, 4],  # noqa: B006
     kinds: list[str] = list(KINDS),  # noqa: B006
     sets: int = 5,
-    frames: int = 200_000,
-    every: int = 20_000,
+    frames: int = 500_000,
+    every: int = 50_000,
     source: str = "table1",
     results: Path = Path("results"),
     runs: Path = Path("runs"),
@@ -113,7 +113,7 @@ def show(
     world = SceneSet.open(scenes or cells[0].info["scenes"])
     sets = {cell.info["kind"]: [entry["goals"] for entry in cell.info["curves"]] for cell in cells}
     bounds = {kind: [walked_lengths(world, torch.tensor(g)) for g in goals] for kind, goals in sets.items()}
-    print(transfer_table(cells, threshold, bounds))
+    print(transfer_table(cells, threshold, bounds), difference_table(cells), sep="\n\n")
     print(draw_transfer(cells, out, bounds))
 
 

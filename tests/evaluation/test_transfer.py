@@ -11,7 +11,7 @@ from vusfa.envs import resolve_goals
 from vusfa.errors import GoalError
 from vusfa.evaluation.results import Cell
 from vusfa.evaluation.transfer import KINDS, area_under, frames_to, new_goals, walked_lengths
-from vusfa.evaluation.transfer_figure import draw_transfer, mean_over, transfer_table
+from vusfa.evaluation.transfer_figure import difference_table, draw_transfer, mean_over, transfer_table
 from vusfa.scenes import Scene, SceneSet
 
 
@@ -74,7 +74,8 @@ def cell(model: str, seed: int, lengths: list[list[float]]) -> Cell:
         }
         for row in lengths
     ]
-    return Cell("transfer", f"{model}-{seed}", {"model": model, "kind": "1-step", "curves": curves}, {})
+    info = {"model": model, "seed": seed, "kind": "1-step", "curves": curves}
+    return Cell("transfer", f"{model}-{seed}", info, {})
 
 
 def test_the_table_by_hand() -> None:
@@ -123,3 +124,18 @@ def test_floor_and_ceiling_stand_below_the_models() -> None:
     lines = transfer_table(made, 5.0, {"1-step": [(300.0, 10.0), (320.0, 14.0)]}).splitlines()
     assert lines[-2].startswith("| 1-step | random walk | – | – | 310.0 [")
     assert lines[-1].startswith("| 1-step | shortest path | – | – | 12.0 [")
+
+
+def test_differences_by_hand() -> None:
+    """Areas of gvf: 55 and 62.5 with seed 0, 70 with seed 1; of usfa 10 less each, and nothing of seed 1."""
+    gvf = [cell("gvf", 0, [[100, 50, 20], [100, 60, 30]]), cell("gvf", 1, [[100, 70, 40], [100, 70, 40]])]
+    usfa = [cell("usfa", 0, [[90, 40, 10], [90, 50, 20]])]
+    rows = [
+        [part.strip() for part in line.split("|")[1:-1]]
+        for line in difference_table([*gvf, *usfa]).splitlines()
+    ]
+    assert rows[2][:4] == ["1-step", "gvf", "from scratch", "2"]
+    assert rows[2][4].split(" ")[0] == f"{(55 + 62.5 + 70 + 70) / 4 - 500:.1f}"
+    assert rows[3][:4] == ["1-step", "usfa", "from scratch", "1"]
+    assert rows[4] == ["1-step", "usfa", "gvf", "1", "-10.0 [-10.0, -10.0]"]
+    assert len(rows) == 5

@@ -13,10 +13,11 @@ from vusfa.evaluation.results import Cell
 from vusfa.evaluation.statistics import Estimate, Sums, bootstrap_mean
 from vusfa.evaluation.transfer import KINDS, area_under, frames_to
 
-__all__ = ["draw_transfer", "mean_over", "transfer_table"]
+__all__ = ["difference_table", "draw_transfer", "mean_over", "transfer_table"]
 
 WAYS = ("trained on", "from scratch")
 BOUNDS = ("random walk", "shortest path")
+PAIRS = (("usfa", "gvf"), ("sfdp", "usfa"), ("vusfa", "sfdp"), ("vusfa", "gvf"))
 _COLOURS = {"gvf": "#0072b2", "usfa": "#e69f00", "sfdp": "#009e73", "vusfa": "#cc79a7"}
 
 
@@ -71,6 +72,40 @@ def transfer_table(
         for index, name in enumerate(BOUNDS if kind in bounds else ()):
             length = _number(mean_over([[pair[index] for pair in bounds[kind]]]))
             lines.append(f"| {kind} | {name} | – | – | {length} | – | – | – | – |")
+    return "\n".join(lines)
+
+
+def difference_table(cells: Sequence[Cell]) -> str:
+    """Markdown: differences of the mean length over the training, paired by seed and set of goals, with 95 %
+    intervals: of each model trained on from the same model from scratch, and of neighbours trained on.
+
+    Less than 0: fewer actions than what it is compared with.
+
+    Args:
+        cells: of the experiment; of seeds that both sides of a pair have.
+    """
+    areas: dict[tuple[str, str, str], dict[int, list[float]]] = {}
+    for cell in cells:
+        for way in WAYS:
+            here = areas.setdefault((cell.info["kind"], cell.info["model"], way), {})
+            curves = [entry[way] for entry in cell.info["curves"]]
+            here[cell.info["seed"]] = [area_under(c["frames"], c["length"]) for c in curves]
+    lines = [
+        "| new goals | trained on | against | seeds | difference, mean of the curve |",
+        "|---|---|---|---|---|",
+    ]
+    for kind in KINDS:
+        models = [model for model in _COLOURS if (kind, model, WAYS[0]) in areas]
+        pairs = [((model, WAYS[0]), (model, WAYS[1])) for model in models]
+        pairs += [((a, WAYS[0]), (b, WAYS[0])) for a, b in PAIRS if a in models and b in models]
+        for one, other in pairs:
+            left, right = areas[(kind, *one)], areas[(kind, *other)]
+            seeds = sorted(left.keys() & right.keys())
+            if not seeds:
+                continue
+            paired = [[a - b for a, b in zip(left[s], right[s], strict=True)] for s in seeds]
+            against = other[0] if one[0] != other[0] else other[1]
+            lines.append(f"| {kind} | {one[0]} | {against} | {len(seeds)} | {_number(mean_over(paired))} |")
     return "\n".join(lines)
 
 
