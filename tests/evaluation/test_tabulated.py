@@ -25,6 +25,19 @@ def test_the_same_logits_as_the_agents(rooms: SceneSet, model: str) -> None:
     torch.testing.assert_close(table.probabilities(state, goal, scene), expected.detach())
 
 
+def test_a_table_of_some_goals_alone(rooms: SceneSet) -> None:
+    torch.manual_seed(0)
+    agent = make_agent("vusfa", scenes=rooms, history=1, hidden_size=8, embedding_size=8)
+    goals = torch.tensor([20, 3])
+    every, some = TabulatedPolicy(agent, rooms), TabulatedPolicy(agent, rooms, goals)
+    for goal, scene in ((3, 0), (20, 1)):
+        state = torch.arange(*rooms.offsets[scene : scene + 2].tolist())
+        to = torch.full_like(state, goal)
+        torch.testing.assert_close(some.logits(state, to), every.logits(state, to))
+    with pytest.raises(IndexError):
+        some.logits(torch.tensor([5]), torch.tensor([4]))
+
+
 @pytest.mark.parametrize("sample", [True, False])
 def test_the_same_walks_as_the_actors(rooms: SceneSet, sample: bool) -> None:
     torch.manual_seed(1)
