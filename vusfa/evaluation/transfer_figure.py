@@ -119,7 +119,7 @@ def draw_transfer(
     from matplotlib.figure import Figure  # of the extra "recipes"
 
     kinds = [kind for kind in KINDS if any(cell.info["kind"] == kind for cell in cells)]
-    figure = Figure(figsize=(4.2 * len(kinds), 4.2), layout="constrained")
+    figure = Figure(figsize=(4.2 * len(kinds), 4.6), layout="constrained")
     panels = figure.subplots(1, len(kinds), sharey=True, squeeze=False)[0]
     for kind, model, here in _groups(cells):
         panel = panels[kinds.index(kind)]
@@ -143,7 +143,8 @@ def draw_transfer(
             height = mean_over([[pair[index] for pair in (bounds or {})[kind]]]).value
             panel.axhline(height, linestyle=style, color="#777777", lw=1, label=BOUNDS[index])
     panels[0].set_ylabel("actions an episode")
-    panels[-1].legend(frameon=False, fontsize=8)
+    handles, labels = panels[-1].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=5, frameon=False, fontsize=8)
     with replacing(path) as unfinished:
         figure.savefig(unfinished, format="png", dpi=120)
     return Path(path)
