@@ -9,7 +9,18 @@ from tensordict.nn import InteractionType
 from torch.distributions import Categorical
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from vusfa.modules import MODELS, PRESETS, ActingPolicy, Agent, action_logits, draw_actions, frozen
+from vusfa.modules import (
+    MODELS,
+    PRESETS,
+    ActingPolicy,
+    Agent,
+    action_chances,
+    action_logits,
+    draw,
+    draw_actions,
+    frozen,
+)
+from vusfa.modules.linear import SceneBlocks
 
 MakeAgent = Callable[..., Agent]
 MakeBatch = Callable[..., TensorDict]
@@ -38,8 +49,12 @@ class TestBesideTheActor:
         wanted = agent.get_policy_operator().get_dist_params(data.clone())["logits"]
         rows = data["state_id"], data["goal_id"], data["scene_id"]
         torch.testing.assert_close(action_logits(agent, *rows), wanted, atol=1e-5, rtol=1e-5)
+        blocks = SceneBlocks.of(data["scene_id"], 3)
+        assert blocks is not None
+        torch.testing.assert_close(action_logits(agent, *rows[:2], blocks), wanted, atol=1e-5, rtol=1e-5)
         with torch.no_grad(), frozen(agent):
             torch.testing.assert_close(action_logits(agent, *rows), wanted, atol=1e-5, rtol=1e-5)
+            torch.testing.assert_close(action_logits(agent, *rows[:2], blocks), wanted, atol=1e-5, rtol=1e-5)
 
 
 def test_it_writes_the_action_alone(small_agent: MakeAgent, make_batch: MakeBatch) -> None:
@@ -76,6 +91,17 @@ class TestDraws:
         wanted = Categorical(logits=logits).sample()
         torch.manual_seed(1)
         assert torch.equal(draw_actions(logits), wanted)
+
+    @pytest.mark.parametrize("rows", [1, 7, 500])
+    def test_chances_are_drawn_from_as_multinomial_does(self, rows: int) -> None:
+        chances = action_chances(torch.randn(rows, 4) * 3)
+        torch.testing.assert_close(chances, Categorical(probs=chances).probs)
+        for seed in range(20):
+            torch.manual_seed(seed)
+            wanted, after = torch.multinomial(chances, 1).squeeze(-1), torch.get_rng_state()
+            torch.manual_seed(seed)
+            assert torch.equal(draw(chances), wanted)
+            assert torch.equal(torch.get_rng_state(), after)
 
     def test_by_hand(self) -> None:
         logits = torch.tensor([0.0, 1.0, -torch.inf]).expand(20_000, 3)

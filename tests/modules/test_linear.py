@@ -34,6 +34,19 @@ class TestSceneLinear:
         rows = linear.SceneRows(scene, [scene_id.count(number) for number in range(4)])
         torch.testing.assert_close(layer(x, rows), by_rows(layer, x, scene))
 
+    @given(scene_id=st.lists(st.integers(0, 3), min_size=1, max_size=40))
+    def test_rows_in_blocks(self, scene_id: list[int]) -> None:
+        layer, scene = SceneLinear(4, 5, 7), torch.tensor(scene_id)
+        x, blocks = torch.randn(len(scene_id), 5), linear.SceneBlocks.of(scene, 4)
+        most = max(scene_id.count(number) for number in range(4))
+        assert (blocks is None) == (4 * most > 1.5 * len(scene_id))
+        if blocks is not None:
+            assert blocks.size == most
+            laid = blocks.lay_out(x)
+            assert laid.shape == (4, most, 5)
+            torch.testing.assert_close(blocks.pick_up(laid), x)
+            torch.testing.assert_close(blocks.pick_up(layer(laid, blocks)), by_rows(layer, x, scene))
+
     @given(scene_id=st.lists(st.integers(0, 3), min_size=1, max_size=12), wide=st.booleans())
     def test_each_row_meets_its_own_scene(self, scene_id: list[int], wide: bool) -> None:
         """Narrow outputs are computed for all scenes and picked, wide ones by sorting."""

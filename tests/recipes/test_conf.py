@@ -100,18 +100,20 @@ def test_fast_is_controlled_but_for_the_clock(settings):
     """The four models differ in nothing but their ideas: what fast changes, it changes for all of them."""
     fast, controlled = settings("preset=fast", "folder=here"), settings("preset=controlled", "folder=here")
     for key in fast:
-        if key != "agent":
+        if key not in ("agent", "optim"):
             assert fast[key] == controlled[key]
-    changed = {key for key in fast.agent if fast.agent[key] != controlled.agent[key]}
-    assert changed == {"history", "hidden_size", "embedding_size"}
+    assert {key for key in fast.agent if fast.agent[key] != controlled.agent[key]} == {"history"}
     assert (fast.agent.preset, fast.agent.history, fast.agent.hidden_size) == ("controlled", 1, 256)
+    assert {key for key in fast.optim if fast.optim[key] != controlled.optim[key]} == {"lr"}
+    assert fast.optim.lr == 1e-3
 
 
 def test_the_numbers_of_controlled(settings):
     cfg = settings("preset=controlled")
+    assert (cfg.agent.history, cfg.agent.hidden_size, cfg.agent.embedding_size) == (None, 256, 256)
     assert cfg.optim == {
         "kind": "adam",
-        "lr": 1e-3,
+        "lr": 5e-4,
         "horizon": 6_000_000,
         "max_grad_norm": 1.0,
         "options": {"eps": 1e-5, "fused": True},

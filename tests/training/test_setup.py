@@ -10,7 +10,7 @@ import pytest
 import torch
 from omegaconf import OmegaConf
 
-from vusfa.errors import ConfigError
+from vusfa.errors import ConfigError, VusfaError
 from vusfa.training import Training, make_training
 from vusfa.training.launch import compose
 
@@ -138,3 +138,18 @@ def test_written_down_or_not_the_same_is_learned(scene_file: Path):
                 training.session.count(batch, terms, 1.0)
         weights.append(training.session.agent.state_dict())
     torch.testing.assert_close(*weights, rtol=1e-4, atol=1e-5)
+
+
+def test_weights_that_are_no_numbers_end_the_training(scene_file: Path, tmp_path: Path):
+    training = made(scene_file)
+    path = tmp_path / "checkpoint.pt"
+    with training.session.collecting(training.make_collector) as batches:
+        batch, terms = training.update(batches)
+        training.session.count(batch, terms, 1.0)
+        before = training.session.save(path).read_bytes()
+        with torch.no_grad():
+            training.session.agent.fusion.linear.bias[1] = math.nan
+        for call in (training.session.metrics, lambda: training.session.save(path)):
+            with pytest.raises(VusfaError, match=r"24 frames.*fusion.linear.bias.*optim.lr"):
+                call()
+    assert path.read_bytes() == before

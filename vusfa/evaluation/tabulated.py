@@ -12,7 +12,7 @@ from tensordict.nn import TensorDictModuleBase
 from tensordict.nn.probabilistic import interaction_type
 from torch import Tensor
 
-from vusfa.modules import Agent, StateGoalPairs, draw_actions, frozen
+from vusfa.modules import Agent, StateGoalPairs, frozen
 from vusfa.scenes import SceneSet
 
 __all__ = ["TabulatedPolicy"]
@@ -45,17 +45,17 @@ class TabulatedPolicy(TensorDictModuleBase):
     ) -> None:
         super().__init__()
         self.in_keys, self.out_keys = ["state_id", "goal_id"], ["action"]
-        self._pairs, was = StateGoalPairs(scenes, goals), agent.training
+        was = agent.training
         agent.eval()
         try:
             with frozen(agent):
-                self._table = self._pairs.logits(agent, at_once)
+                self._table = StateGoalPairs(scenes, goals).actions(agent, at_once)
         finally:
             agent.train(was)
 
     def logits(self, state: Tensor, goal: Tensor) -> Tensor:
         """The agent's logits (\\*B, A) for global ids of states and of goals in the same scene, (\\*B,)."""
-        return self._table[self._pairs.rows(state, goal)]
+        return self._table.logits(state, goal)
 
     def probabilities(self, state: Tensor, goal: Tensor, scene: Tensor) -> Tensor:
         """The chances of the actions, for :func:`vusfa.evaluation.exact.exact_goals`."""
@@ -63,6 +63,5 @@ class TabulatedPolicy(TensorDictModuleBase):
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Adds ``action``, (\\*B,) int64."""
-        logits = self.logits(tensordict.get("state_id")[..., -1], tensordict.get("goal_id"))
-        actions = draw_actions(logits.flatten(0, -2), interaction_type())
-        return tensordict.set("action", actions.view(logits.shape[:-1]))
+        state, goal = tensordict.get("state_id")[..., -1], tensordict.get("goal_id")
+        return tensordict.set("action", self._table(state, goal, interaction_type()))

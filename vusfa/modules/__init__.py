@@ -7,7 +7,7 @@
 'state_value'
 """
 
-from vusfa.modules.acting import ActingPolicy, action_logits, draw_actions
+from vusfa.modules.acting import ActingPolicy, action_chances, action_logits, draw, draw_actions
 from vusfa.modules.agents import Agent, make_agent, transplant
 from vusfa.modules.autoencoder import explained_features, pretrain_autoencoder
 from vusfa.modules.bottleneck import GaussianEncoder, LatentSampler
@@ -16,7 +16,7 @@ from vusfa.modules.frames import FeatureFrames, PictureFrames
 from vusfa.modules.freezing import frozen
 from vusfa.modules.linear import HistoryLinear, SceneLinear
 from vusfa.modules.normalised import NormalisedEncoder
-from vusfa.modules.pairs import StateGoalPairs, sees_one_frame
+from vusfa.modules.pairs import ActionTable, StateGoalPairs, sees_one_frame
 from vusfa.modules.policy import PolicyHead, SuccessorPolicyHead
 from vusfa.modules.presets import MODELS, PRESETS, AgentConfig, resolve_config
 from vusfa.modules.siamese import SiameseEncoder
@@ -27,6 +27,7 @@ __all__ = [
     "MODELS",
     "PRESETS",
     "ActingPolicy",
+    "ActionTable",
     "Agent",
     "AgentConfig",
     "FeatureFrames",
@@ -47,7 +48,9 @@ __all__ = [
     "SuccessorValue",
     "TriedActions",
     "ValueHead",
+    "action_chances",
     "action_logits",
+    "draw",
     "draw_actions",
     "explained_features",
     "frozen",

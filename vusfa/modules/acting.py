@@ -18,25 +18,26 @@ from tensordict.nn import TensorDictModuleBase
 from tensordict.nn.probabilistic import InteractionType, interaction_type
 from torch import Tensor
 
-from vusfa.modules.linear import SceneRows
+from vusfa.modules.linear import RowScenes, SceneBlocks, SceneRows
 from vusfa.modules.policy import SuccessorPolicyHead
 from vusfa.modules.trunk import SiameseTrunk
 
 if TYPE_CHECKING:
     from vusfa.modules.agents import Agent
-    from vusfa.modules.pairs import StateGoalPairs
+    from vusfa.modules.pairs import ActionTable, StateGoalPairs
 
-__all__ = ["ActingPolicy", "action_logits", "draw_actions"]
+__all__ = ["ActingPolicy", "action_chances", "action_logits", "draw", "draw_actions"]
 
 
-def action_logits(agent: Agent, state: Tensor, goal: Tensor, scene_id: Tensor | SceneRows) -> Tensor:
+def action_logits(agent: Agent, state: Tensor, goal: Tensor, scene_id: RowScenes) -> Tensor:
     """An agent's logits, without anything else that its actor writes on the way.
 
     Args:
         agent: one without a memory.
         state: (R, H) int64 ids, oldest first, or observations (R, H, ...), as the agent reads them.
         goal: (R,) ids, or observations (R, ...).
-        scene_id: (R,) int64; or, of rows sorted by scene, with the counts.
+        scene_id: (R,) int64; or, of rows sorted by scene, with the counts; or blocks that the rows, in any
+            order, are to be laid out in.
 
     Returns:
         (R, A) float32.
@@ -49,6 +50,12 @@ def action_logits(agent: Agent, state: Tensor, goal: Tensor, scene_id: Tensor | 
     torch.Size([3, 4])
     """
     fused = SiameseTrunk(agent.encoder, agent.fusion).fused(state, goal)
+    if isinstance(scene_id, SceneBlocks):
+        return scene_id.pick_up(_of_fused(agent, scene_id.lay_out(fused), scene_id))
+    return _of_fused(agent, fused, scene_id)
+
+
+def _of_fused(agent: Agent, fused: Tensor, scene_id: RowScenes) -> Tensor:
     hidden = agent.scene_layer(fused, scene_id)
     if isinstance(agent.policy, SuccessorPolicyHead):
         assert agent.successor is not None
@@ -74,9 +81,32 @@ def draw_actions(logits: Tensor, interaction: InteractionType | None = None) -> 
     if interaction in (InteractionType.MODE, InteractionType.DETERMINISTIC):
         return logits.argmax(-1)
     if interaction in (None, InteractionType.RANDOM):
-        probability = (logits - logits.logsumexp(-1, keepdim=True)).softmax(-1)
-        return torch.multinomial(probability, 1, replacement=True).squeeze(-1)
+        return draw(action_chances(logits))
     raise NotImplementedError(f"interaction type {interaction}: actions have none; take RANDOM or MODE")
+
+
+def action_chances(logits: Tensor) -> Tensor:
+    """Chances (\\*B, A) of the actions from logits (\\*B, A), rounded as ``torch.distributions.Categorical``
+    rounds them.
+
+    >>> action_chances(torch.tensor([0.0, 0.0]))
+    tensor([0.5000, 0.5000])
+    """
+    return (logits - logits.logsumexp(-1, keepdim=True)).softmax(-1)
+
+
+def draw(chances: Tensor) -> Tensor:
+    """An action (\\*B,) int64 of each row of chances (\\*B, A).
+
+    The race that ``torch.multinomial`` runs: exponential clocks, of which the first to ring wins; the same
+    numbers from torch's global generator, and the same winner. What it asks of all chances beforehand at each
+    call (that they are finite and none is negative) is left out.
+
+    >>> draw(torch.tensor([[0.0, 1.0], [1.0, 0.0]]))
+    tensor([1, 0])
+    """
+    clocks = torch.empty_like(chances, memory_format=torch.contiguous_format).exponential_()
+    return (chances / clocks).argmax(-1)
 
 
 class ActingPolicy(TensorDictModuleBase):
@@ -112,7 +142,7 @@ class ActingPolicy(TensorDictModuleBase):
         ]
         self.out_keys = ["action"]
         self._num_scenes = agent.scene_layer.linear.num_scenes  # that have weights of their own
-        self._table: tuple[StateGoalPairs, Tensor] | None = None
+        self._table: ActionTable | None = None
 
     @contextmanager
     def tabulated(self, pairs: StateGoalPairs) -> Iterator[None]:
@@ -125,7 +155,7 @@ class ActingPolicy(TensorDictModuleBase):
         Raises:
             ValueError: the agent sees more than one frame, or something else than ids.
         """
-        self._table = pairs, pairs.logits(self.agent)
+        self._table = pairs.actions(self.agent)
         try:
             yield
         finally:
@@ -140,16 +170,18 @@ class ActingPolicy(TensorDictModuleBase):
             goal.reshape(-1, *goal.shape[batch:]),
             scene.reshape(-1),
         )
-        return tensordict.set(
-            "action", draw_actions(self._logits(*rows), interaction_type()).view(scene.shape)
-        )
+        if self._table is not None:
+            actions = self._table(rows[0][:, -1], rows[1], interaction_type())
+        else:
+            actions = draw_actions(self._logits(*rows), interaction_type())
+        return tensordict.set("action", actions.view(scene.shape))
 
     def _logits(self, state: Tensor, goal: Tensor, scene: Tensor) -> Tensor:
-        if self._table is not None:
-            pairs, table = self._table
-            return table[pairs.rows(state[:, -1], goal)]
         if self._num_scenes == 1 or scene.is_cuda:  # there counting means waiting for the device
             return action_logits(self.agent, state, goal, scene)
+        blocks = SceneBlocks.of(scene, self._num_scenes)
+        if blocks is not None:
+            return action_logits(self.agent, state, goal, blocks)
         scene, order = scene.sort(stable=True)
         rows = SceneRows(scene, torch.bincount(scene, minlength=self._num_scenes).tolist())
         logits = action_logits(self.agent, state[order], goal[order], rows)

@@ -7,7 +7,7 @@ released code.
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 
 import torch
 from torch import Tensor, nn
@@ -15,12 +15,14 @@ from torch.nn import functional
 
 from vusfa.modules.freezing import Freezable, for_autocast
 
-__all__ = ["HistoryLinear", "SceneLinear", "SceneRows"]
+__all__ = ["HistoryLinear", "RowScenes", "SceneBlocks", "SceneLinear", "SceneRows"]
 
 #: At most this many outputs a row are computed for nothing before rows are sorted by scene instead.
 _DENSE_OUTPUTS = 64
 #: On an accelerator sorting means waiting for it, so a few scenes are all computed there.
 _DENSE_SCENES = 8
+#: Rows are laid out in blocks of one size where that makes them at most this many times as many.
+_PADDING = 1.5
 
 
 class SceneRows(NamedTuple):
@@ -33,6 +35,53 @@ class SceneRows(NamedTuple):
 
     scene: Tensor
     counts: list[int]
+
+
+class SceneBlocks(NamedTuple):
+    """A few rows laid out scene by scene in blocks of one size, so that a layer is one batched product.
+
+    A product a scene costs more in calls than in arithmetic where rows are few. What fills a block up is the
+    batch's first row.
+
+    Attributes:
+        size: rows of a block, m.
+        source: (n * m,) int64, the row that stands at each place.
+        place: (R,) int64, where each row stands.
+    """
+
+    size: int
+    source: Tensor
+    place: Tensor
+
+    @classmethod
+    def of(cls, scene: Tensor, num_scenes: int) -> SceneBlocks | None:
+        """Of rows of the scenes (R,) int64; None where some scene has so many that filling up costs more.
+
+        >>> blocks = SceneBlocks.of(torch.tensor([1, 0, 1, 0, 1]), 2)
+        >>> blocks.source.tolist(), blocks.place.tolist()
+        ([1, 3, 0, 0, 2, 4], [3, 0, 4, 1, 5])
+        """
+        ordered, order = scene.sort(stable=True)
+        counts = torch.bincount(scene, minlength=num_scenes)
+        size = int(counts.max())
+        if num_scenes * size > _PADDING * len(scene):
+            return None
+        first = torch.arange(0, num_scenes * size, size) - (counts.cumsum(0) - counts)
+        places = first[ordered] + torch.arange(len(scene))
+        source = torch.zeros(num_scenes * size, dtype=torch.int64).index_copy_(0, places, order)
+        return cls(size, source, torch.empty_like(places).index_copy_(0, order, places))
+
+    def lay_out(self, rows: Tensor) -> Tensor:
+        """(R, F) to (n, m, F)."""
+        return functional.embedding(self.source, rows).view(-1, self.size, rows.shape[-1])
+
+    def pick_up(self, blocks: Tensor) -> Tensor:
+        """(n, m, F) to (R, F)."""
+        return functional.embedding(self.place, blocks.flatten(0, 1))
+
+
+#: Which scene each row is of, and how rows lie: scene indices of rows in any order, or one of the layouts.
+RowScenes: TypeAlias = Tensor | SceneRows | SceneBlocks
 
 
 class SceneLinear(Freezable):
@@ -77,12 +126,14 @@ class SceneLinear(Freezable):
         """Draws weights and biases anew, uniform in +-1/sqrt(in_features)."""
         _uniform_(self.weight, self.bias, fan_in=self.in_features)
 
-    def forward(self, x: Tensor, scene_id: Tensor | SceneRows) -> Tensor:
+    def forward(self, x: Tensor, scene_id: RowScenes) -> Tensor:
         """Maps (\\*B, in) with scene indices (\\*B,) int64 to (\\*B, out); rows sorted by scene, (R, in), may
-        come with their :class:`SceneRows`."""
+        come with their :class:`SceneRows`, and blocks (n, m, in) with their :class:`SceneBlocks`."""
         weight, bias = self._weights(x)
         if self.num_scenes == 1:
             return functional.linear(x, weight.squeeze(0), bias.squeeze(0))
+        if isinstance(scene_id, SceneBlocks):
+            return torch.baddbmm(bias.unsqueeze(1), x, weight.transpose(1, 2))
         if isinstance(scene_id, SceneRows):
             if self.num_scenes * self.out_features <= _DENSE_OUTPUTS:
                 return self._all_scenes(x, scene_id.scene, weight, bias)
@@ -210,8 +261,11 @@ class HistoryLinear(nn.Module):
         places = index * self.history + torch.arange(self.history, device=index.device)
         # One kernel looks up and sums, forwards and backwards; five to ten times faster than indexing,
         # then sum.
-        sums = functional.embedding_bag(places.view(-1, self.history), projected.flatten(0, 1), mode="sum")
-        return (sums + self.bias).view(*index.shape[:-1], -1)
+        table = projected.flatten(0, 1)
+        if not torch.is_grad_enabled():
+            table = table.detach()  # else what a gradient would need is noted down all the same
+        sums = functional.embedding_bag(places.view(-1, self.history), table, mode="sum")
+        return (sums + self.bias.to(sums.dtype)).view(*index.shape[:-1], -1)
 
     def extra_repr(self) -> str:
         """What ``print`` shows of the layer."""

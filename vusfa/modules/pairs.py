@@ -10,16 +10,17 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import torch
+from tensordict.nn.probabilistic import InteractionType
 from torch import Tensor
 
-from vusfa.modules.acting import action_logits
+from vusfa.modules.acting import action_chances, action_logits, draw, draw_actions
 from vusfa.modules.linear import SceneRows
 from vusfa.scenes import SceneSet
 
 if TYPE_CHECKING:
     from vusfa.modules.agents import Agent
 
-__all__ = ["StateGoalPairs", "sees_one_frame"]
+__all__ = ["ActionTable", "StateGoalPairs", "sees_one_frame"]
 
 
 def sees_one_frame(agent: Agent) -> bool:
@@ -98,3 +99,42 @@ class StateGoalPairs:
                 rows = SceneRows(scene, torch.bincount(scene, minlength=heads).tolist())
             parts.append(action_logits(agent, state.unsqueeze(-1), goal, rows))
         return torch.cat(parts)
+
+    def actions(self, agent: Agent, at_once: int = 50_000) -> ActionTable:
+        """What an agent does in each pair, as it is now; arguments and errors as those of :meth:`logits`."""
+        return ActionTable(self, self.logits(agent, at_once))
+
+
+class ActionTable:
+    """A policy that is written down: for each pair its logits, and its chances once they are asked for.
+
+    Draws are those of :func:`~vusfa.modules.acting.draw_actions` from the pair's logits.
+
+    Args:
+        pairs: of a world.
+        logits: (P, A) of them.
+
+    >>> rooms = SceneSet.bundled(["bathroom"])
+    >>> pairs = StateGoalPairs(rooms, torch.tensor([3]))
+    >>> table = ActionTable(pairs, torch.tensor([0.0, 50.0, 0.0, 0.0]).expand(len(pairs), 4))
+    >>> table(torch.tensor([5, 6]), torch.tensor([3, 3]))
+    tensor([1, 1])
+    """
+
+    def __init__(self, pairs: StateGoalPairs, logits: Tensor) -> None:
+        self.pairs = pairs
+        self._logits = logits
+        self._chances: Tensor | None = None
+
+    def __call__(self, state: Tensor, goal: Tensor, interaction: InteractionType | None = None) -> Tensor:
+        """Actions (\\*B,) for global ids of states and of goals in the same scene, (\\*B,)."""
+        rows = self.pairs.rows(state, goal)
+        if interaction not in (None, InteractionType.RANDOM):
+            return draw_actions(self._logits[rows], interaction)
+        if self._chances is None:
+            self._chances = action_chances(self._logits)
+        return draw(self._chances[rows])
+
+    def logits(self, state: Tensor, goal: Tensor) -> Tensor:
+        """Logits (\\*B, A) for the same."""
+        return self._logits[self.pairs.rows(state, goal)]

@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from vusfa.errors import ConfigError
-from vusfa.modules.linear import SceneLinear, SceneRows
+from vusfa.modules.linear import RowScenes, SceneLinear
 
 __all__ = ["PolicyHead", "SuccessorPolicyHead"]
 
@@ -30,7 +30,7 @@ class PolicyHead(nn.Module):
         super().__init__()
         self.linear = SceneLinear(num_scenes, hidden_size, num_actions)
 
-    def forward(self, hidden: Tensor, scene_id: Tensor | SceneRows) -> Tensor:
+    def forward(self, hidden: Tensor, scene_id: RowScenes) -> Tensor:
         """(\\*B, hidden_size) with scene indices (\\*B,) to logits (\\*B, A) float32."""
         return self.linear(hidden, scene_id).float()
 
@@ -76,7 +76,7 @@ class SuccessorPolicyHead(nn.Module):
         self.successor_gain = successor_gain
         self.rectify_logits = rectify_logits
 
-    def forward(self, hidden: Tensor, successor: Tensor, scene_id: Tensor | SceneRows) -> Tensor:
+    def forward(self, hidden: Tensor, successor: Tensor, scene_id: RowScenes) -> Tensor:
         """(\\*B, hidden_size), psi (\\*B, E) and scene indices (\\*B,) to logits (\\*B, A) float32."""
         constant = self._scaled(successor.detach())
         code = functional.relu(self.first(torch.cat([hidden, constant.to(hidden.dtype)], -1), scene_id))

@@ -9,7 +9,7 @@ from __future__ import annotations
 from torch import Tensor, nn
 from torch.nn import functional
 
-from vusfa.modules.linear import SceneLinear, SceneRows
+from vusfa.modules.linear import RowScenes, SceneLinear
 
 __all__ = ["RewardHead", "SuccessorHead", "SuccessorValue", "ValueHead"]
 
@@ -34,7 +34,7 @@ class SuccessorHead(nn.Module):
         self.linear = SceneLinear(num_scenes, hidden_size, embedding_size)
         self.scale = scale
 
-    def forward(self, hidden: Tensor, scene_id: Tensor | SceneRows) -> Tensor:
+    def forward(self, hidden: Tensor, scene_id: RowScenes) -> Tensor:
         """(\\*B, hidden_size) with scene indices (\\*B,) to (\\*B, E) float32."""
         successor = self.linear(hidden, scene_id).float()  # nobody else's: scaled where it lies
         return successor if self.scale == 1.0 else successor.mul_(self.scale)
@@ -90,6 +90,6 @@ class ValueHead(nn.Module):
         super().__init__()
         self.linear = SceneLinear(num_scenes, hidden_size, 1)
 
-    def forward(self, hidden: Tensor, scene_id: Tensor | SceneRows) -> Tensor:
+    def forward(self, hidden: Tensor, scene_id: RowScenes) -> Tensor:
         """(\\*B, hidden_size) with scene indices (\\*B,) to (\\*B, 1) float32."""
         return self.linear(hidden, scene_id).float()

@@ -9,7 +9,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from vusfa.modules.freezing import Freezable, for_autocast
-from vusfa.modules.linear import SceneLinear, SceneRows
+from vusfa.modules.linear import RowScenes, SceneLinear
 
 __all__ = ["Fusion", "SceneLayer", "SiameseTrunk"]
 
@@ -129,6 +129,6 @@ class SceneLayer(nn.Module):
         super().__init__()
         self.linear = SceneLinear(num_scenes, in_features, hidden_size)
 
-    def forward(self, fused: Tensor, scene_id: Tensor | SceneRows) -> Tensor:
+    def forward(self, fused: Tensor, scene_id: RowScenes) -> Tensor:
         """(\\*B, in) with scene indices (\\*B,) to (\\*B, hidden_size)."""
         return functional.relu(self.linear(fused, scene_id))

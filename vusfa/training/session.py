@@ -16,7 +16,7 @@ from torchrl.collectors import BaseCollector, Collector
 from torchrl.objectives import LossModule
 
 from vusfa.envs import SceneObservation
-from vusfa.errors import CheckpointError, ConfigError
+from vusfa.errors import CheckpointError, ConfigError, VusfaError
 from vusfa.modules import Agent, frozen, make_agent
 from vusfa.scenes import SceneSet, bundled_names
 from vusfa.training.checkpoint import (
@@ -149,7 +149,12 @@ class Session:
         self.terms.update(terms)
 
     def metrics(self) -> dict[str, float]:
-        """A line of the log: what the meters hold, which begin anew, and how far the training has come."""
+        """A line of the log: what the meters hold, which begin anew, and how far the training has come.
+
+        Raises:
+            VusfaError: a weight that is not a number any more.
+        """
+        self._check_weights()
         head = {
             "updates": float(self.updates),
             "seconds": self.seconds,
@@ -158,7 +163,12 @@ class Session:
         return head | self.episodes.flush() | self.terms.flush()
 
     def save(self, path: str | Path) -> Path:
-        """Write a checkpoint, atomically, while collecting; see :mod:`vusfa.training.checkpoint`."""
+        """Write a checkpoint, atomically, while collecting; see :mod:`vusfa.training.checkpoint`.
+
+        Raises:
+            VusfaError: a weight that is not a number any more; the checkpoint before stays as it is.
+        """
+        self._check_weights()
         if self._collector is None:
             raise RuntimeError(
                 "a session is saved within collecting(): where the environments stand belongs to it"
@@ -188,6 +198,14 @@ class Session:
                 "rng": random_state(),
             },
         )
+
+    def _check_weights(self) -> None:
+        wrong = [name for name, param in self.agent.named_parameters() if not param.isfinite().all()]
+        if wrong:
+            raise VusfaError(
+                f"after {self.frames:,} frames the weights {', '.join(wrong)} are not finite any more; choose"
+                " a smaller optim.lr or optim.max_grad_norm, and resume an earlier checkpoint or begin anew"
+            )
 
     def adopt(self, state: Mapping[str, Any], path: str | Path = "the checkpoint") -> None:
         """Take over a checkpoint's weights and the bottleneck's multiplier, and nothing else.
