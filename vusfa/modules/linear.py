@@ -15,7 +15,7 @@ from torch.nn import functional
 
 from vusfa.modules.freezing import Freezable, for_autocast
 
-__all__ = ["HistoryLinear", "RowScenes", "SceneBlocks", "SceneLinear", "SceneRows"]
+__all__ = ["HistoryLinear", "RowScenes", "SceneBlocks", "SceneLinear", "SceneRows", "steady_linear"]
 
 #: At most this many outputs a row are computed for nothing before rows are sorted by scene instead.
 _DENSE_OUTPUTS = 64
@@ -23,6 +23,33 @@ _DENSE_OUTPUTS = 64
 _DENSE_SCENES = 8
 #: Rows are laid out in blocks of one size where that makes them at most this many times as many.
 _PADDING = 1.5
+
+
+def steady_linear(rows: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
+    """``torch.nn.functional.linear``, for numbers of rows that are another one at each call.
+
+    In bfloat16 on a processor every number of rows gets kernels of its own, which take longer to make than to
+    run and stay in memory. So rows of zeros are added, an eighth at most, that leave few different numbers;
+    what comes out, forwards and backwards, is the same.
+
+    Args:
+        rows: (R, in), or with more dimensions, of which no care is taken.
+        weight: (out, in).
+        bias: (out,).
+
+    Returns:
+        (R, out).
+
+    >>> steady_linear(torch.ones(3, 2), torch.ones(1, 2), torch.ones(1)).flatten()
+    tensor([3., 3., 3.])
+    """
+    half = weight.dtype == torch.bfloat16 or for_autocast(rows).dtype == torch.bfloat16
+    number = len(rows)
+    step = max(16, 1 << max(0, number.bit_length() - 4))
+    missing = -number % step
+    if rows.dim() != 2 or not half or rows.is_cuda or not missing:
+        return functional.linear(rows, weight, bias)
+    return functional.linear(functional.pad(rows, (0, 0, 0, missing)), weight, bias)[:number]
 
 
 class SceneRows(NamedTuple):
@@ -131,7 +158,7 @@ class SceneLinear(Freezable):
         come with their :class:`SceneRows`, and blocks (n, m, in) with their :class:`SceneBlocks`."""
         weight, bias = self._weights(x)
         if self.num_scenes == 1:
-            return functional.linear(x, weight.squeeze(0), bias.squeeze(0))
+            return steady_linear(x, weight.squeeze(0), bias.squeeze(0))
         if isinstance(scene_id, SceneBlocks):
             return torch.baddbmm(bias.unsqueeze(1), x, weight.transpose(1, 2))
         if isinstance(scene_id, SceneRows):
@@ -149,7 +176,7 @@ class SceneLinear(Freezable):
         return result.reshape(*x.shape[:-1], self.out_features)
 
     def _all_scenes(self, rows: Tensor, scene: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
-        every = functional.linear(rows, weight.flatten(0, 1), bias.flatten())
+        every = steady_linear(rows, weight.flatten(0, 1), bias.flatten())
         every = every.view(-1, self.num_scenes, self.out_features)
         return every.gather(1, scene.view(-1, 1, 1).expand(-1, 1, self.out_features)).squeeze(1)
 
@@ -159,7 +186,7 @@ class SceneLinear(Freezable):
         weights, biases = weight.unbind(0), bias.unbind(0)
         if max(counts) == len(rows):
             only = counts.index(len(rows))
-            return functional.linear(rows, weights[only], biases[only])
+            return steady_linear(rows, weights[only], biases[only])
         if bool((scene[1:] >= scene[:-1]).all()):  # as a batch sorted by scene has it: nothing to move
             return torch.cat(self._products(rows, counts, weights, biases))
         order = scene.argsort(stable=True)
@@ -174,7 +201,7 @@ class SceneLinear(Freezable):
     ) -> list[Tensor]:
         """Of rows sorted by scene, each scene's with its weights."""
         parts = zip(rows.split(counts), weights, biases, strict=True)
-        return [functional.linear(part, weight, bias) for part, weight, bias in parts if len(part)]
+        return [steady_linear(part, weight, bias) for part, weight, bias in parts if len(part)]
 
     def _weights(self, x: Tensor) -> tuple[Tensor, Tensor]:
         if self._frozen is not None and (self._frozen[0].requires_grad or not torch.is_grad_enabled()):

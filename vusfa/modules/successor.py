@@ -9,7 +9,7 @@ from __future__ import annotations
 from torch import Tensor, nn
 from torch.nn import functional
 
-from vusfa.modules.linear import RowScenes, SceneLinear
+from vusfa.modules.linear import RowScenes, SceneLinear, steady_linear
 
 __all__ = ["RewardHead", "SuccessorHead", "SuccessorValue", "ValueHead"]
 
@@ -62,7 +62,8 @@ class RewardHead(nn.Module):
 
     def forward(self, goal: Tensor) -> Tensor:
         """Goal embedding, or a sample of it, (\\*B, E) to (\\*B, E) float32."""
-        return self.scale * self.last(functional.relu(self.first(goal))).float()
+        first = functional.relu(steady_linear(goal, self.first.weight, self.first.bias))
+        return self.scale * steady_linear(first, self.last.weight, self.last.bias).float()
 
 
 class SuccessorValue(nn.Module):
