@@ -108,7 +108,7 @@ def train_until(
 def run(options: Options) -> Report:
     """The four models with the recipe's settings, then SB3's two."""
     report = Report("solve")
-    cap, every = (0.5, 0.5) if options.quick else (options.cap, 10.0)
+    cap, every = (0.5, 0.5) if options.quick else (options.cap, 2.0)
     torch.set_num_threads(options.threads)
     outcomes: dict[str, Outcome] = {}
     for model in MODELS:

@@ -135,3 +135,44 @@ class TestHistoryLinear:
     def test_starts_uniform_over_the_whole_history(self) -> None:
         weight = HistoryLinear(4, 100, 50).weight
         assert 0.049 < weight.abs().max().item() <= 0.05
+
+
+class TestSteadyLinear:
+    @given(number=st.integers(1, 700), data=st.data())
+    def test_as_if_no_row_were_added(self, number: int, data: st.DataObject) -> None:
+        """To the last bit where this was measured; other processors may sum over rows in another order."""
+        torch.manual_seed(data.draw(st.integers(0, 9)))
+        made = [torch.randn(*shape).bfloat16() for shape in ((number, 24), (16, 24), (16,))]
+        outcomes = []
+        for compute in (linear.steady_linear, torch.nn.functional.linear):
+            inputs = [x.clone().requires_grad_() for x in made]
+            out = compute(*inputs)
+            torch.manual_seed(1)
+            outcomes.append((out, *torch.autograd.grad(out, inputs, torch.randn_like(out))))
+        for ours, wanted in zip(*outcomes, strict=True):
+            torch.testing.assert_close(ours, wanted, rtol=0.008, atol=0.02)
+
+    def test_few_numbers_of_rows(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        seen = []
+        plain = torch.nn.functional.linear
+        monkeypatch.setattr(
+            torch.nn.functional, "linear", lambda x, *rest: (seen.append(len(x)), plain(x, *rest))[1]
+        )
+        weight, bias = torch.ones(2, 3).bfloat16(), torch.zeros(2).bfloat16()
+        asked = range(1, 3000, 7)
+        for number in asked:
+            assert linear.steady_linear(torch.ones(number, 3).bfloat16(), weight, bias).shape == (number, 2)
+        assert len(set(seen)) < 60
+        assert all(
+            before <= now < max(1.25 * before, before + 16) for before, now in zip(asked, seen, strict=True)
+        )
+
+    def test_float32_is_left_alone(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        def refuse(*_: object) -> None:
+            raise AssertionError("rows were added")
+
+        monkeypatch.setattr(torch.nn.functional, "pad", refuse)
+        x, weight, bias = torch.randn(5, 3), torch.randn(2, 3), torch.randn(2)
+        torch.testing.assert_close(linear.steady_linear(x, weight, bias), x @ weight.T + bias)
+        with torch.autocast("cpu", torch.bfloat16), pytest.raises(AssertionError, match="rows were added"):
+            linear.steady_linear(x, weight, bias)

@@ -249,6 +249,16 @@ class TestTerms:
         assert target.grad is None
         torch.testing.assert_close(psi.grad[1], torch.tensor([-2.0, -2.0, -4.0]) / 3)
 
+    def test_successor_loss_has_the_gradients_of_a_squared_error(self) -> None:
+        successor = torch.randn(3, 5, dtype=torch.float64, requires_grad=True)
+        target = torch.randn(3, 5, dtype=torch.float64)
+        assert torch.autograd.gradcheck(lambda x: successor_loss(x, target), successor)
+        assert torch.autograd.gradgradcheck(lambda x: successor_loss(x, target), successor)
+        (ours,) = torch.autograd.grad(successor_loss(successor, target).sum(), successor)
+        torch.testing.assert_close(ours, 2 * (successor - target).detach() / 5)
+        each = torch.func.vmap(torch.func.grad(lambda x, y: successor_loss(x, y)))(successor, target)
+        torch.testing.assert_close(each, ours)
+
     def test_policy_gradient_loss(self) -> None:
         log_prob = torch.tensor([-1.0, -2.0], requires_grad=True)
         advantage = torch.tensor([3.0, -0.5], requires_grad=True)

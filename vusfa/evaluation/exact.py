@@ -148,28 +148,17 @@ def expected_walks(
     True
     """
     parts = []
-    for index, scene in enumerate(scenes.scenes):
-        first = int(scenes.offsets[index])
-        here = goals[scenes.scene_id[goals] == index] - first
-        successor = scenes.successor[first : first + scene.num_states] - first
-        if probabilities is None:
-            acts = torch.full((len(here), *successor.shape), 1 / successor.shape[1], dtype=torch.float64)
-        else:
-            state = torch.arange(scene.num_states).repeat(len(here)) + first
-            goal = here.repeat_interleave(scene.num_states) + first
-            told = probabilities(state, goal, torch.full_like(state, index))
-            acts = told.view(len(here), *successor.shape).double()
-        chance = torch.zeros(len(here), scene.num_states, dtype=torch.float64)
-        chance[torch.arange(len(here)), here] = 1
+    for index in range(len(scenes.scenes)):
+        here = goals[scenes.scene_id[goals] == index] - int(scenes.offsets[index])
+        chain = _chain(probabilities, scenes, index, here)
+        chance, shortest = chain.arrived, chain.shortest
         length, arrived = torch.zeros_like(chance), torch.zeros_like(chance)
         for k in range(1, max_steps + 1):
             length += 1 - chance
-            before, chance = chance, reach_step(acts, successor, here, chance)
+            before, chance = chance, reach_step(chain.acts, chain.successor, here, chance)
             arrived += k * (chance - before)
-        shortest = scene.distance[:, here].T
-        counted = shortest > 0
         columns = (length, chance, arrived, chance * shortest, shortest.double())
-        parts.append([(column * counted).sum(1) / counted.sum(1) for column in columns])
+        parts.append([chain.mean(column) for column in columns])
     return ExpectedWalks(*(torch.cat(column) for column in zip(*parts, strict=True)))
 
 
@@ -192,33 +181,61 @@ def exact_goals(
     rows = []
     with frozen(agent if agent is not None else torch.nn.Module()):
         for index, scene in enumerate(scenes.scenes):
-            first = int(scenes.offsets[index])
             for goals in torch.arange(scene.num_states).split(at_once):
-                rows.append(_some_goals(probabilities, scenes, index, first, goals))
+                rows.append(_some_goals(probabilities, scenes, index, goals))
     return ExactGoals(*(torch.cat(column) for column in zip(*rows, strict=True)))
 
 
 def _some_goals(
-    probabilities: Probabilities, scenes: SceneSet, index: int, first: int, goals: Tensor
+    probabilities: Probabilities, scenes: SceneSet, index: int, goals: Tensor
 ) -> tuple[Tensor, ...]:
-    scene = scenes.scenes[index]
-    size = scene.num_states
-    state = torch.arange(size).repeat(len(goals)) + first
-    goal = goals.repeat_interleave(size) + first
-    chance = probabilities(state, goal, torch.full_like(state, index)).view(len(goals), size, -1).double()
-    successor = scenes.successor[first : first + size] - first
-    shortest = scene.distance[:, goals].T
-    counted = shortest > 0
-    before = chance.new_zeros(len(goals), size)
-    before[torch.arange(len(goals)), goals] = 1
-    reached, spl = {}, chance.new_zeros(len(goals), size)
+    chain = _chain(probabilities, scenes, index, goals)
+    before, shortest = chain.arrived, chain.shortest
+    reached, spl = {}, torch.zeros_like(before)
     for k in range(1, 501):
-        now = reach_step(chance, successor, goals, before)
+        now = reach_step(chain.acts, chain.successor, goals, before)
         spl += (now - before) * shortest / shortest.clamp(min=k)
         before = now
         if k in (100, 500):
             reached[k] = now
-    kept = counted.any(1)
-    means = [(values * counted).sum(1) / counted.sum(1) for values in (reached[100], reached[500], spl)]
+    kept = (shortest > 0).any(1)
+    means = [chain.mean(values) for values in (reached[100], reached[500], spl)]
     columns = torch.full_like(goals, index), goals, *means
     return tuple(column[kept] for column in columns)
+
+
+class _Chain(NamedTuple):
+    """Walks in one scene to G of its goals.
+
+    Attributes:
+        acts: (G, n, A) float64, chances of the actions.
+        successor: (n, A), where they lead.
+        arrived: (G, n) float64, chance of having arrived before the first of them.
+        shortest: (G, n), actions of the shortest walk; -1 where there is none.
+    """
+
+    acts: Tensor
+    successor: Tensor
+    arrived: Tensor
+    shortest: Tensor
+
+    def mean(self, values: Tensor) -> Tensor:
+        """(G, n) to (G,): over the starts that can reach the goal in more than 0 actions."""
+        counted = self.shortest > 0
+        return (values * counted).sum(1) / counted.sum(1)
+
+
+def _chain(probabilities: Probabilities | None, scenes: SceneSet, index: int, goals: Tensor) -> _Chain:
+    scene, first = scenes.scenes[index], int(scenes.offsets[index])
+    size = scene.num_states
+    successor = scenes.successor[first : first + size] - first
+    if probabilities is None:
+        acts = torch.full((len(goals), *successor.shape), 1 / successor.shape[1], dtype=torch.float64)
+    else:
+        state = torch.arange(size).repeat(len(goals)) + first
+        goal = goals.repeat_interleave(size) + first
+        told = probabilities(state, goal, torch.full_like(state, index))
+        acts = told.view(len(goals), *successor.shape).double()
+    arrived = torch.zeros(len(goals), size, dtype=torch.float64)
+    arrived[torch.arange(len(goals)), goals] = 1
+    return _Chain(acts, successor, arrived, scene.distance[:, goals].T)

@@ -29,8 +29,8 @@ def steady_linear(rows: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
     """``torch.nn.functional.linear``, for numbers of rows that are another one at each call.
 
     In bfloat16 on a processor every number of rows gets kernels of its own, which take longer to make than to
-    run and stay in memory. So rows of zeros are added, an eighth at most, that leave few different numbers;
-    what comes out, forwards and backwards, is the same.
+    run and stay in memory. So rows of zeros are added, an eighth at most where there are many, that leave few
+    different numbers; to what comes out, forwards and backwards, they add nothing.
 
     Args:
         rows: (R, in), or with more dimensions, of which no care is taken.
