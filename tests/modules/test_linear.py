@@ -137,6 +137,14 @@ class TestHistoryLinear:
         assert 0.049 < weight.abs().max().item() <= 0.05
 
 
+@given(number=st.integers(1, 10**6))
+def test_steady_numbers_are_few_and_near(number: int) -> None:
+    steady = linear.steady_number(number)
+    assert number <= steady < max(number + 16, 1.125 * number + 1)
+    assert linear.steady_number(steady) == steady
+    assert linear.steady_number(number + 1) >= steady
+
+
 class TestSteadyLinear:
     @given(number=st.integers(1, 700), data=st.data())
     def test_as_if_no_row_were_added(self, number: int, data: st.DataObject) -> None:

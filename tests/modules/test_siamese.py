@@ -82,6 +82,21 @@ class TestByIds:
             torch.testing.assert_close(code, wanted, rtol=0.02, atol=0.02)
             torch.testing.assert_close(code, other, rtol=0.02, atol=0.02)
 
+    @pytest.mark.parametrize("half", [True, False])
+    def test_few_numbers_of_distinct_frames_in_half_precision(
+        self, scenes: SceneSet, monkeypatch: pytest.MonkeyPatch, half: bool
+    ) -> None:
+        module, seen, plain = encoder(scenes), [], FeatureFrames.lookup
+        monkeypatch.setattr(
+            FeatureFrames, "lookup", lambda frames, ids: (seen.append(len(ids)), plain(frames, ids))[1]
+        )
+        different = range(1, 15)
+        for number in different:
+            state_id = torch.arange(number).unsqueeze(-1).expand(-1, 4)
+            with torch.autocast("cpu", torch.bfloat16, enabled=half):
+                module(state_id, torch.arange(number))
+        assert seen == ([16] * len(different) if half else list(different))
+
     def test_a_longer_history_is_cut_to_the_newest_frames(self, scenes: SceneSet) -> None:
         module = encoder(scenes, 2)
         state_id, goal_id = ids(scenes, 6, history=5)

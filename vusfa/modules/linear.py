@@ -15,7 +15,16 @@ from torch.nn import functional
 
 from vusfa.modules.freezing import Freezable, for_autocast
 
-__all__ = ["HistoryLinear", "RowScenes", "SceneBlocks", "SceneLinear", "SceneRows", "steady_linear"]
+__all__ = [
+    "HistoryLinear",
+    "RowScenes",
+    "SceneBlocks",
+    "SceneLinear",
+    "SceneRows",
+    "is_steady",
+    "steady_linear",
+    "steady_number",
+]
 
 #: At most this many outputs a row are computed for nothing before rows are sorted by scene instead.
 _DENSE_OUTPUTS = 64
@@ -25,12 +34,30 @@ _DENSE_SCENES = 8
 _PADDING = 1.5
 
 
+def steady_number(number: int) -> int:
+    """The next larger one of a few numbers: 16, 32, ... 256, 288, ..., 512, 576, ..., eight to an octave.
+
+    In bfloat16 on a processor every number of rows gets kernels of its own, which take longer to make than to
+    run and stay in memory. Where the number is another one at each call, rows that nobody reads make it one
+    of these few.
+
+    >>> [steady_number(number) for number in (1, 17, 256, 257, 1025)]
+    [16, 32, 256, 288, 1152]
+    """
+    step = max(16, 1 << max(0, number.bit_length() - 4))
+    return number + -number % step
+
+
+def is_steady(rows: Tensor) -> bool:
+    """Whether rows (R, ...) may well be as many as they are: in float32, or on an accelerator."""
+    return rows.is_cuda or for_autocast(rows).dtype != torch.bfloat16
+
+
 def steady_linear(rows: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
     """``torch.nn.functional.linear``, for numbers of rows that are another one at each call.
 
-    In bfloat16 on a processor every number of rows gets kernels of its own, which take longer to make than to
-    run and stay in memory. So rows of zeros are added, an eighth at most where there are many, that leave few
-    different numbers; to what comes out, forwards and backwards, they add nothing.
+    Where that matters rows of zeros are added, see :func:`steady_number`; to what comes out, forwards and
+    backwards, they add nothing.
 
     Args:
         rows: (R, in), or with more dimensions, of which no care is taken.
@@ -43,11 +70,11 @@ def steady_linear(rows: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
     >>> steady_linear(torch.ones(3, 2), torch.ones(1, 2), torch.ones(1)).flatten()
     tensor([3., 3., 3.])
     """
-    half = weight.dtype == torch.bfloat16 or for_autocast(rows).dtype == torch.bfloat16
     number = len(rows)
-    step = max(16, 1 << max(0, number.bit_length() - 4))
-    missing = -number % step
-    if rows.dim() != 2 or not half or rows.is_cuda or not missing:
+    if rows.dim() != 2 or is_steady(rows):
+        return functional.linear(rows, weight, bias)
+    missing = steady_number(number) - number
+    if not missing:
         return functional.linear(rows, weight, bias)
     return functional.linear(functional.pad(rows, (0, 0, 0, missing)), weight, bias)[:number]
 

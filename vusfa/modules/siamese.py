@@ -25,7 +25,7 @@ from torch.nn import functional
 from vusfa.errors import ConfigError
 from vusfa.modules.frames import FeatureFrames, PictureFrames
 from vusfa.modules.freezing import Freezable, for_autocast
-from vusfa.modules.linear import HistoryLinear
+from vusfa.modules.linear import HistoryLinear, is_steady, steady_number
 
 __all__ = ["Branch", "Head", "Heads", "SiameseEncoder", "as_it_is", "interleaved", "num_parts"]
 
@@ -197,6 +197,7 @@ class SiameseEncoder(Freezable):
     ) -> tuple[Any, Any]:
         features, state_row, goal_row = self._distinct_features(states, goals)
         goal_row, goal_index = torch.unique(goal_row, return_inverse=True)
+        goal_row = self._steadily(goal_row)
         first = self.branch.first
         if self.history == 1:
             each = first(features.unsqueeze(-2))
@@ -227,7 +228,17 @@ class SiameseEncoder(Freezable):
         if len(goals) >= self.frames.num_states:
             return self.frames.lookup(None), states, goals
         distinct, row = torch.unique(torch.cat([states.flatten(), goals]), return_inverse=True)
-        return self.frames.lookup(distinct), row[: states.numel()].view_as(states), row[states.numel() :]
+        return (
+            self.frames.lookup(self._steadily(distinct)),
+            row[: states.numel()].view_as(states),
+            row[states.numel() :],
+        )
+
+    def _steadily(self, distinct: Tensor) -> Tensor:
+        """More of them, which nobody reads, so that their number is one of a few."""
+        if is_steady(self.branch.first.bias):
+            return distinct
+        return functional.pad(distinct, (0, steady_number(len(distinct)) - len(distinct)))
 
     def _from_frozen(self, states: Tensor, goals: Tensor, heads: Heads, part: int | None) -> tuple[Any, Any]:
         assert self._frozen is not None
