@@ -43,9 +43,6 @@ def run(options: Options) -> Report:
     little = small(replace(options, quick=True))
     grown = _apart(growth, little, updates)
     report.rows.append(Row(f"growth over {updates:,} updates", grown, "MiB", note="of a tiny network"))
-    # bfloat16 products have kernels of their own for each number of rows, and distinct rows are never as many
-    plain = _apart(growth, [*little, "autocast=false"], updates)
-    report.rows.append(Row(f"growth over {updates:,} updates, float32", plain, "MiB", note="of the same"))
     if not options.quick:
         what = f"growth of resident memory over {updates:,} updates"
         report.requirements.append(Requirement(what, grown, SLACK, "MiB", at_least=False))
