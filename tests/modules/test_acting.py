@@ -20,7 +20,7 @@ from vusfa.modules import (
     draw_actions,
     frozen,
 )
-from vusfa.modules.linear import SceneBlocks
+from vusfa.modules.rows import SceneBlocks
 
 MakeAgent = Callable[..., Agent]
 MakeBatch = Callable[..., TensorDict]

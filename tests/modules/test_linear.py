@@ -7,6 +7,7 @@ from hypothesis import strategies as st
 from torch.utils.flop_counter import FlopCounterMode
 
 from vusfa.modules import HistoryLinear, SceneLinear, linear
+from vusfa.modules.rows import SceneBlocks, SceneRows
 
 
 def by_rows(layer: SceneLinear, x: torch.Tensor, scene_id: torch.Tensor) -> torch.Tensor:
@@ -31,13 +32,13 @@ class TestSceneLinear:
     def test_sorted_rows_that_are_counted(self, scene_id: list[int], wide: bool) -> None:
         layer = SceneLinear(4, 5, 40 if wide else 4)
         x, scene = torch.randn(len(scene_id), 5), torch.tensor(sorted(scene_id))
-        rows = linear.SceneRows(scene, [scene_id.count(number) for number in range(4)])
+        rows = SceneRows(scene, [scene_id.count(number) for number in range(4)])
         torch.testing.assert_close(layer(x, rows), by_rows(layer, x, scene))
 
     @given(scene_id=st.lists(st.integers(0, 3), min_size=1, max_size=40))
     def test_rows_in_blocks(self, scene_id: list[int]) -> None:
         layer, scene = SceneLinear(4, 5, 7), torch.tensor(scene_id)
-        x, blocks = torch.randn(len(scene_id), 5), linear.SceneBlocks.of(scene, 4)
+        x, blocks = torch.randn(len(scene_id), 5), SceneBlocks.of(scene, 4)
         most = max(scene_id.count(number) for number in range(4))
         assert (blocks is None) == (4 * most > 1.5 * len(scene_id))
         if blocks is not None:
@@ -135,52 +136,3 @@ class TestHistoryLinear:
     def test_starts_uniform_over_the_whole_history(self) -> None:
         weight = HistoryLinear(4, 100, 50).weight
         assert 0.049 < weight.abs().max().item() <= 0.05
-
-
-@given(number=st.integers(1, 10**6))
-def test_steady_numbers_are_few_and_near(number: int) -> None:
-    steady = linear.steady_number(number)
-    assert number <= steady < max(number + 16, 1.125 * number + 1)
-    assert linear.steady_number(steady) == steady
-    assert linear.steady_number(number + 1) >= steady
-
-
-class TestSteadyLinear:
-    @given(number=st.integers(1, 700), data=st.data())
-    def test_as_if_no_row_were_added(self, number: int, data: st.DataObject) -> None:
-        """To the last bit where this was measured; other processors may sum over rows in another order."""
-        torch.manual_seed(data.draw(st.integers(0, 9)))
-        made = [torch.randn(*shape).bfloat16() for shape in ((number, 24), (16, 24), (16,))]
-        outcomes = []
-        for compute in (linear.steady_linear, torch.nn.functional.linear):
-            inputs = [x.clone().requires_grad_() for x in made]
-            out = compute(*inputs)
-            torch.manual_seed(1)
-            outcomes.append((out, *torch.autograd.grad(out, inputs, torch.randn_like(out))))
-        for ours, wanted in zip(*outcomes, strict=True):
-            torch.testing.assert_close(ours, wanted, rtol=0.008, atol=0.02)
-
-    def test_few_numbers_of_rows(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        seen = []
-        plain = torch.nn.functional.linear
-        monkeypatch.setattr(
-            torch.nn.functional, "linear", lambda x, *rest: (seen.append(len(x)), plain(x, *rest))[1]
-        )
-        weight, bias = torch.ones(2, 3).bfloat16(), torch.zeros(2).bfloat16()
-        asked = range(1, 3000, 7)
-        for number in asked:
-            assert linear.steady_linear(torch.ones(number, 3).bfloat16(), weight, bias).shape == (number, 2)
-        assert len(set(seen)) < 60
-        assert all(
-            before <= now < max(1.25 * before, before + 16) for before, now in zip(asked, seen, strict=True)
-        )
-
-    def test_float32_is_left_alone(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        def refuse(*_: object) -> None:
-            raise AssertionError("rows were added")
-
-        monkeypatch.setattr(torch.nn.functional, "pad", refuse)
-        x, weight, bias = torch.randn(5, 3), torch.randn(2, 3), torch.randn(2)
-        torch.testing.assert_close(linear.steady_linear(x, weight, bias), x @ weight.T + bias)
-        with torch.autocast("cpu", torch.bfloat16), pytest.raises(AssertionError, match="rows were added"):
-            linear.steady_linear(x, weight, bias)

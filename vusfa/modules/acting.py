@@ -18,8 +18,8 @@ from tensordict.nn import TensorDictModuleBase
 from tensordict.nn.probabilistic import InteractionType, interaction_type
 from torch import Tensor
 
-from vusfa.modules.linear import RowScenes, SceneBlocks, SceneRows
 from vusfa.modules.policy import SuccessorPolicyHead
+from vusfa.modules.rows import RowScenes, SceneBlocks, SceneRows
 from vusfa.modules.trunk import SiameseTrunk
 
 if TYPE_CHECKING:

@@ -14,7 +14,7 @@ from tensordict.nn.probabilistic import InteractionType
 from torch import Tensor
 
 from vusfa.modules.acting import action_chances, action_logits, draw, draw_actions
-from vusfa.modules.linear import SceneRows
+from vusfa.modules.rows import SceneRows
 from vusfa.scenes import SceneSet
 
 if TYPE_CHECKING:

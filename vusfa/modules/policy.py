@@ -14,7 +14,8 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from vusfa.errors import ConfigError
-from vusfa.modules.linear import RowScenes, SceneLinear
+from vusfa.modules.linear import SceneLinear
+from vusfa.modules.rows import RowScenes
 
 __all__ = ["PolicyHead", "SuccessorPolicyHead"]
 

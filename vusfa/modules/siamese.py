@@ -25,7 +25,8 @@ from torch.nn import functional
 from vusfa.errors import ConfigError
 from vusfa.modules.frames import FeatureFrames, PictureFrames
 from vusfa.modules.freezing import Freezable, for_autocast
-from vusfa.modules.linear import HistoryLinear, is_steady, steady_number
+from vusfa.modules.linear import HistoryLinear
+from vusfa.modules.rows import is_steady, steady_number
 
 __all__ = ["Branch", "Head", "Heads", "SiameseEncoder", "as_it_is", "interleaved", "num_parts"]
 

@@ -9,7 +9,8 @@ from __future__ import annotations
 from torch import Tensor, nn
 from torch.nn import functional
 
-from vusfa.modules.linear import RowScenes, SceneLinear, steady_linear
+from vusfa.modules.linear import SceneLinear
+from vusfa.modules.rows import RowScenes, steady_linear
 
 __all__ = ["RewardHead", "SuccessorHead", "SuccessorValue", "ValueHead"]
 

@@ -9,7 +9,8 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from vusfa.modules.freezing import Freezable, for_autocast
-from vusfa.modules.linear import RowScenes, SceneLinear
+from vusfa.modules.linear import SceneLinear
+from vusfa.modules.rows import RowScenes
 
 __all__ = ["Fusion", "SceneLayer", "SiameseTrunk"]
 
