@@ -40,8 +40,7 @@ def run(options: Options) -> Report:
     report.rows.append(Row("peak resident memory of a training", most["ids"], "MiB", "features", times))
     report.rows.append(Row("peak resident memory, features", most["features"], "MiB"))
     updates = 20 if options.quick else 10_000
-    little = small(replace(options, quick=True))
-    grown = _apart(growth, little, updates)
+    grown = _apart(growth, small(replace(options, quick=True)), updates)
     report.rows.append(Row(f"growth over {updates:,} updates", grown, "MiB", note="of a tiny network"))
     if not options.quick:
         what = f"growth of resident memory over {updates:,} updates"

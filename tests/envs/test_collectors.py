@@ -71,8 +71,14 @@ def test_collectors_store_and_load_it_strictly(make_env: Callable[[], TargetNavE
         make_env, None, frames_per_batch=48, total_frames=96, auto_register_policy_transforms=False
     )
     next(iter(collector))
+    before = {key: value.clone() for key, value in collector.env.state_dict().items()}
+    assert before
     state = collector.state_dict()
+    assert state["env_state_dict"] == {}  # which strictly lacks what the environment has
     collector.env.load_state_dict(state["env_state_dict"])
+    after = collector.env.state_dict()
+    assert after.keys() == before.keys()
+    assert all(torch.equal(after[key], value) for key, value in before.items())
     collector.shutdown()
 
 

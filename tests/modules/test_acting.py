@@ -20,7 +20,7 @@ from vusfa.modules import (
     draw_actions,
     frozen,
 )
-from vusfa.modules.rows import SceneBlocks
+from vusfa.modules.rows import SceneBlocks, SceneRows
 
 MakeAgent = Callable[..., Agent]
 MakeBatch = Callable[..., TensorDict]
@@ -49,7 +49,7 @@ class TestBesideTheActor:
         wanted = agent.get_policy_operator().get_dist_params(data.clone())["logits"]
         rows = data["state_id"], data["goal_id"], data["scene_id"]
         torch.testing.assert_close(action_logits(agent, *rows), wanted, atol=1e-5, rtol=1e-5)
-        blocks = SceneBlocks.of(data["scene_id"], 3)
+        blocks = SceneBlocks.of(*SceneRows.sort(data["scene_id"], 3))
         assert blocks is not None
         torch.testing.assert_close(action_logits(agent, *rows[:2], blocks), wanted, atol=1e-5, rtol=1e-5)
         with torch.no_grad(), frozen(agent):

@@ -38,7 +38,7 @@ class TestSceneLinear:
     @given(scene_id=st.lists(st.integers(0, 3), min_size=1, max_size=40))
     def test_rows_in_blocks(self, scene_id: list[int]) -> None:
         layer, scene = SceneLinear(4, 5, 7), torch.tensor(scene_id)
-        x, blocks = torch.randn(len(scene_id), 5), SceneBlocks.of(scene, 4)
+        x, blocks = torch.randn(len(scene_id), 5), SceneBlocks.of(*SceneRows.sort(scene, 4))
         most = max(scene_id.count(number) for number in range(4))
         assert (blocks is None) == (4 * most > 1.5 * len(scene_id))
         if blocks is not None:

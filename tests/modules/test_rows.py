@@ -5,11 +5,11 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from vusfa.modules.rows import SceneBlocks, steady_linear, steady_number
+from vusfa.modules.rows import SceneBlocks, SceneRows, steady_linear, steady_number
 
 
 def test_no_rows_are_no_blocks() -> None:
-    assert SceneBlocks.of(torch.zeros(0, dtype=torch.int64), 3) is None
+    assert SceneBlocks.of(*SceneRows.sort(torch.zeros(0, dtype=torch.int64), 3)) is None
 
 
 @given(number=st.integers(1, 10**6))

@@ -13,6 +13,10 @@ from vusfa.training.checks import check_names, check_types
 def test_a_whole_number_will_do_for_a_fraction():
     check_types({"lr": 1, "new": "x"}, {"lr": 0.5})
     check_types({"horizon": 5}, {"horizon": None})
+    with pytest.raises(ConfigError, match="lr is 'x'"):
+        check_types({"lr": "x"}, {"lr": 0.5})
+    with pytest.raises(ConfigError, match=r"steps is 0\.5"):
+        check_types({"steps": 0.5}, {"steps": 1})
 
 
 @pytest.mark.parametrize("default", [None, 1000])

@@ -179,10 +179,9 @@ class ActingPolicy(TensorDictModuleBase):
     def _logits(self, state: Tensor, goal: Tensor, scene: Tensor) -> Tensor:
         if self._num_scenes == 1 or scene.is_cuda:  # there counting means waiting for the device
             return action_logits(self.agent, state, goal, scene)
-        blocks = SceneBlocks.of(scene, self._num_scenes)
+        rows, order = SceneRows.sort(scene, self._num_scenes)
+        blocks = SceneBlocks.of(rows, order)
         if blocks is not None:
             return action_logits(self.agent, state, goal, blocks)
-        scene, order = scene.sort(stable=True)
-        rows = SceneRows(scene, torch.bincount(scene, minlength=self._num_scenes).tolist())
         logits = action_logits(self.agent, state[order], goal[order], rows)
         return torch.empty_like(logits).index_copy_(0, order, logits)

@@ -14,7 +14,7 @@ from tensordict.nn.probabilistic import InteractionType
 from torch import Tensor
 
 from vusfa.modules.acting import action_chances, action_logits, draw, draw_actions
-from vusfa.modules.rows import SceneRows
+from vusfa.modules.rows import RowScenes, SceneRows
 from vusfa.scenes import SceneSet
 
 if TYPE_CHECKING:
@@ -94,9 +94,9 @@ class StateGoalPairs:
         heads, parts = agent.scene_layer.linear.num_scenes, []
         columns = (part.split(at_once) for part in (self.state, self.goal, self.scene))
         for state, goal, scene in zip(*columns, strict=True):
-            rows: Tensor | SceneRows = scene
+            rows: RowScenes = scene
             if heads > 1 and not scene.is_cuda:  # there counting means waiting for the device
-                rows = SceneRows(scene, torch.bincount(scene, minlength=heads).tolist())
+                rows = SceneRows.of(scene, heads)
             parts.append(action_logits(agent, state.unsqueeze(-1), goal, rows))
         return torch.cat(parts)
 

@@ -6,6 +6,7 @@ numbers of rows that they have met before.
 
 from __future__ import annotations
 
+import itertools
 from typing import NamedTuple, TypeAlias
 
 import torch
@@ -56,9 +57,7 @@ def steady_linear(rows: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
     >>> steady_linear(torch.ones(3, 2), torch.ones(1, 2), torch.ones(1)).flatten()
     tensor([3., 3., 3.])
     """
-    number = len(rows)
-    if rows.dim() != 2 or is_steady(rows):
-        return functional.linear(rows, weight, bias)
+    number = len(rows) if rows.dim() == 2 and not is_steady(rows) else 0
     missing = steady_number(number) - number
     if not missing:
         return functional.linear(rows, weight, bias)
@@ -75,6 +74,22 @@ class SceneRows(NamedTuple):
 
     scene: Tensor
     counts: list[int]
+
+    @classmethod
+    def of(cls, scene: Tensor, num_scenes: int) -> SceneRows:
+        """Counts rows whose scenes (R,) ascend."""
+        return cls(scene, torch.bincount(scene, minlength=num_scenes).tolist())
+
+    @classmethod
+    def sort(cls, scene: Tensor, num_scenes: int) -> tuple[SceneRows, Tensor]:
+        """Rows of the scenes (R,) in ascending order, and (R,) int64, which row each of them is.
+
+        >>> rows, order = SceneRows.sort(torch.tensor([1, 0, 1]), 3)
+        >>> rows.scene.tolist(), rows.counts, order.tolist()
+        ([0, 1, 1], [1, 2, 0], [1, 0, 2])
+        """
+        ordered, order = scene.sort(stable=True)
+        return cls.of(ordered, num_scenes), order
 
 
 class SceneBlocks(NamedTuple):
@@ -94,22 +109,23 @@ class SceneBlocks(NamedTuple):
     place: Tensor
 
     @classmethod
-    def of(cls, scene: Tensor, num_scenes: int) -> SceneBlocks | None:
-        """Of rows of the scenes (R,) int64; None where there are none, or some scene has
-        so many that filling up costs more.
+    def of(cls, rows: SceneRows, order: Tensor) -> SceneBlocks | None:
+        """Of what :meth:`SceneRows.sort` returns; None where there are no rows, or some scene has so many
+        that filling up costs more.
 
-        >>> blocks = SceneBlocks.of(torch.tensor([1, 0, 1, 0, 1]), 2)
+        >>> blocks = SceneBlocks.of(*SceneRows.sort(torch.tensor([1, 0, 1, 0, 1]), 2))
         >>> blocks.source.tolist(), blocks.place.tolist()
         ([1, 3, 0, 0, 2, 4], [3, 0, 4, 1, 5])
         """
-        ordered, order = scene.sort(stable=True)
-        counts = torch.bincount(scene, minlength=num_scenes)
-        size = int(counts.max())
-        if not size or num_scenes * size > _PADDING * len(scene):
+        number, size = len(order), max(rows.counts)
+        whole = len(rows.counts) * size
+        if not size or whole > _PADDING * number:
             return None
-        first = torch.arange(0, num_scenes * size, size) - (counts.cumsum(0) - counts)
-        places = first[ordered] + torch.arange(len(scene))
-        source = torch.zeros(num_scenes * size, dtype=torch.int64).index_copy_(0, places, order)
+        # each scene's rows stand so much further on than among the sorted ones
+        before = itertools.accumulate(rows.counts[:-1], initial=0)
+        further = torch.tensor([index * size - first for index, first in enumerate(before)])
+        places = further[rows.scene] + torch.arange(number)
+        source = torch.zeros(whole, dtype=torch.int64).index_copy_(0, places, order)
         return cls(size, source, torch.empty_like(places).index_copy_(0, order, places))
 
     def lay_out(self, rows: Tensor) -> Tensor:
