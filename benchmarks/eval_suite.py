@@ -10,9 +10,9 @@ from benchmarks.report import Options, Report, Requirement, Row
 from benchmarks.trainer import recipe_settings
 from vusfa.envs import resolve_goals
 from vusfa.evaluation import evaluate
+from vusfa.experiments.cells import evaluation_policy, evaluation_precision
 from vusfa.modules import ActingPolicy, make_agent
 from vusfa.scenes import SceneSet
-from vusfa.training.cells import evaluation_policy, evaluation_precision
 
 __all__ = ["run"]
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from vusfa.evaluation.files import write_json
+from vusfa.files import write_json
 
 __all__ = ["Options", "Report", "Requirement", "Row", "read_reports", "write_reports"]
 

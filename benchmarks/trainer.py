@@ -1,6 +1,6 @@
 """Training updates as ``recipes/train.py`` makes them, one at a time, without files and log lines.
 
-The settings are the recipe's own, composed from ``recipes/conf`` as its command line would, and the calls are
+The settings are the recipe's own, composed from ``vusfa/conf`` as its command line would, and the calls are
 the recipe's: what is measured is what a user gets. ``tests/benchmarks/test_trainer.py`` holds the two to one
 another, weight for weight.
 """
@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import ExitStack
-from pathlib import Path
 from typing import Any
 
 import torch
@@ -22,7 +21,7 @@ from vusfa.training.launch import compose
 
 __all__ = ["CONF", "Trainer", "make_trainer", "recipe_settings", "small"]
 
-CONF = Path(__file__).parents[1] / "recipes" / "conf"
+from vusfa.conf import FOLDER as CONF
 
 
 def recipe_settings(overrides: Sequence[str] = ()) -> DictConfig:

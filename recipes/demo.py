@@ -1,7 +1,7 @@
 """Trains VUSFA on the bundled bathroom's five goals, evaluates it, films a walk: make demo, or python
 recipes/demo.py
 
-Settings are in recipes/conf/demo.yaml. Everything goes to the folder demo: the checkpoint, the tables,
+Settings are in vusfa/conf/demo.yaml. Everything goes to the folder demo: the checkpoint, the tables,
 walk.gif, curve.png.
 """
 
@@ -12,6 +12,7 @@ from pathlib import Path
 from omegaconf import DictConfig
 from train import train
 
+from vusfa.conf import FOLDER as CONF
 from vusfa.evaluation.curve import plot_curve
 from vusfa.evaluation.film import draw_film, longest_success, record_walk, write_gif
 from vusfa.training.launch import launch
@@ -39,4 +40,4 @@ def demo(cfg: DictConfig, overrides: list[str]) -> int:
 
 
 if __name__ == "__main__":
-    launch(demo, Path(__file__).parent / "conf", "demo")
+    launch(demo, CONF, "demo")

@@ -20,8 +20,8 @@ from omegaconf import OmegaConf
 from vusfa.errors import SceneError, VusfaError
 from vusfa.evaluation import Episodes, evaluate, print_summary, random_walk_summary, summary
 from vusfa.evaluation.exact import exact_goals
-from vusfa.evaluation.results import Cell, read_cells, write_cell
-from vusfa.evaluation.unseen import unseen_table
+from vusfa.experiments.results import Cell, read_cells, write_cell
+from vusfa.experiments.unseen import unseen_table
 from vusfa.modules import ActingPolicy, TriedActions, transplant
 from vusfa.scenes import SceneSet
 from vusfa.training import EvaluationProgress, load_agent, run_facts
@@ -30,7 +30,7 @@ from vusfa.training.launch import compose
 sys.path.insert(0, str(Path(__file__).parent))
 from train import train
 
-CONF = Path(__file__).parent / "conf"
+from vusfa.conf import FOLDER as CONF
 
 
 def split_rooms(folder: Path, trained: int, tested: int) -> tuple[list[str], list[str]]:

@@ -17,7 +17,7 @@ from typing import Annotated, Literal
 import tyro
 
 from vusfa.errors import VusfaError
-from vusfa.evaluation.files import check_folder
+from vusfa.files import check_folder
 from vusfa.report import Options, read_source, write_report
 from vusfa.report.page import even
 from vusfa.training import set_threads

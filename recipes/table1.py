@@ -17,16 +17,16 @@ import tyro
 from omegaconf import OmegaConf, open_dict
 
 from vusfa.errors import VusfaError
-from vusfa.evaluation.files import replacing
-from vusfa.evaluation.results import read_cell, write_cell
+from vusfa.experiments.cells import choose_checkpoint, measure_checkpoint
+from vusfa.experiments.results import read_cell, write_cell
+from vusfa.files import replacing
 from vusfa.modules.presets import MODELS
-from vusfa.training.cells import choose_checkpoint, measure_checkpoint
 from vusfa.training.launch import compose
 
 sys.path.insert(0, str(Path(__file__).parent))
 from train import train
 
-CONF = Path(__file__).parent / "conf"
+from vusfa.conf import FOLDER as CONF
 
 
 def checkpoints(folder: Path, overrides: list[str], stages: list[float]) -> list[Path]:

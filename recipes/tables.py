@@ -13,10 +13,9 @@ from typing import Annotated
 import tyro
 
 from vusfa.errors import VusfaError
-from vusfa.evaluation.experiment import read_experiment
-from vusfa.evaluation.files import check_folder, write_csv
 from vusfa.evaluation.report import MEAN_OF_STATES, SUBSETS
-from vusfa.evaluation.tables import (
+from vusfa.experiments.experiment import read_experiment
+from vusfa.experiments.tables import (
     MEASURES,
     cell_rows,
     comparison_rows,
@@ -26,6 +25,7 @@ from vusfa.evaluation.tables import (
     middle_rows,
     model_rows,
 )
+from vusfa.files import check_folder, write_csv
 from vusfa.scenes import SceneSet
 from vusfa.training import set_threads
 

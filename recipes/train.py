@@ -1,6 +1,6 @@
 """Trains one of the four models: python recipes/train.py agent.model=vusfa scenes=[bathroom]
 
-Settings are in recipes/conf/train.yaml and the folders beside it. The run's folder gets metrics.csv and
+Settings are in vusfa/conf/train.yaml and the folders beside it. The run's folder gets metrics.csv and
 checkpoint.pt, and at the end evaluation.csv, .json and evaluation_episodes.csv. To go on: python
 recipes/train.py resume=RUN/checkpoint.pt
 """
@@ -9,13 +9,13 @@ from __future__ import annotations
 
 import sys
 import time
-from pathlib import Path
 from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 
+from vusfa.conf import FOLDER as CONF
 from vusfa.evaluation import Comparison, check_comparison, compare, print_summary
-from vusfa.evaluation.files import check_folder
+from vusfa.files import check_folder
 from vusfa.training import (
     EvaluationProgress,
     ProgressLine,
@@ -33,7 +33,7 @@ def train(cfg: DictConfig, overrides: list[str]) -> tuple[Session, Comparison | 
     """Trains, and leaves a checkpoint and an evaluation in ``cfg.folder``.
 
     Args:
-        cfg: settings, as in recipes/conf/train.yaml.
+        cfg: settings, as in vusfa/conf/train.yaml.
         overrides: the command line that made them, for whoever resumes.
 
     Returns:
@@ -100,4 +100,4 @@ def main(cfg: DictConfig, overrides: list[str]) -> int:
 
 
 if __name__ == "__main__":
-    launch(main, Path(__file__).parent / "conf", "train")
+    launch(main, CONF, "train")

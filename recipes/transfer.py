@@ -18,13 +18,13 @@ from rich.console import Console
 from rich.progress import track
 
 from vusfa.errors import CheckpointError, VusfaError
-from vusfa.evaluation.results import Cell, read_cell, read_cells, write_cell
-from vusfa.evaluation.transfer import KINDS, new_goals, walked_lengths
-from vusfa.evaluation.transfer_figure import difference_table, draw_transfer, transfer_table
+from vusfa.experiments.fine_tune import fine_tune, fine_tuning_settings
+from vusfa.experiments.results import Cell, read_cell, read_cells, write_cell
+from vusfa.experiments.transfer import KINDS, new_goals, walked_lengths
+from vusfa.experiments.transfer_figure import difference_table, draw_transfer, transfer_table
 from vusfa.modules.presets import MODELS
 from vusfa.scenes import SceneSet
 from vusfa.training import load_agent, run_facts, set_threads
-from vusfa.training.transfer import fine_tune, fine_tuning_settings
 
 
 def run(

@@ -17,8 +17,9 @@ import tyro
 
 from vusfa.errors import VusfaError
 from vusfa.evaluation import compare, print_summary
-from vusfa.evaluation.files import check_folder
-from vusfa.evaluation.manifest import BUNDLED_MANIFEST, read_manifest
+from vusfa.experiments.cells import evaluation_policy, evaluation_precision
+from vusfa.experiments.manifest import BUNDLED_MANIFEST, read_manifest
+from vusfa.files import check_folder
 from vusfa.training import (
     EvaluationProgress,
     load_agent,
@@ -27,7 +28,6 @@ from vusfa.training import (
     row_name,
     set_threads,
 )
-from vusfa.training.cells import evaluation_policy, evaluation_precision
 
 
 def zero_shot(

@@ -9,14 +9,20 @@ import zlib
 from collections.abc import Callable, Iterator
 from importlib.util import find_spec
 from pathlib import Path
+from typing import Any, ClassVar
 
+import h5py
+import numpy as np
 import pytest
 import torch
 import torch.multiprocessing
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
 
 from vusfa.errors import SceneError
-from vusfa.scenes import Scene
-from vusfa.scenes.render.catalogue import Catalogue
+from vusfa.scenes import Scene, SceneSet
+from vusfa.scenes.graph import shortest_path_distances
+from vusfa.sources.render.catalogue import Catalogue
 
 # A program that a shell script started in the background ignores Ctrl-C, and so do those that it starts. What
 # the tests say of interruptions shall hold there, too.
@@ -60,7 +66,7 @@ def lacking(what: str) -> None:
 @pytest.fixture
 def needs_llvm() -> None:
     """The test renders with LLVM."""
-    from vusfa.scenes.render.backend import choose_backend
+    from vusfa.sources.render.backend import choose_backend
 
     if choose_backend().library is None:
         lacking("a working LLVM (Debian's libllvm19)")
@@ -143,3 +149,123 @@ def wandb_content() -> Callable[[Path], bytes]:
         return b"".join(parts)
 
     return read
+
+
+# Scene files as another program would write them.
+
+
+@pytest.fixture
+def make_file(tmp_path: Path) -> Callable[..., Path]:
+    """Writes a scene file by h5py alone, as another program would; any dataset replaced or left out."""
+
+    def make(name: str = "room.h5", attributes: dict[str, Any] | None = None, **changes: Any) -> Path:
+        # A ring of five states: action 0 onwards, action 1 back, action 2 always blocked.
+        states = np.arange(5)
+        graph = np.stack([(states + 1) % 5, (states - 1) % 5, np.full(5, -1)], axis=1)
+        datasets = {
+            "graph": graph,
+            "resnet_feature": np.random.default_rng(0).standard_normal((5, 2, 7)).astype(np.float32),
+            "location": np.stack([states * 0.5, states * 0.25], axis=1),
+            "rotation": states * 90 % 360,
+            "shortest_path_distance": shortest_path_distances(graph).numpy().astype(np.int64),
+        }
+        datasets.update(changes)
+        path = tmp_path / name
+        with h5py.File(path, "w") as file:
+            for key, value in datasets.items():
+                if value is not None:
+                    file[key] = value
+            file.attrs.update(attributes or {})
+        return path
+
+    return make
+
+
+@pytest.fixture
+def pictures() -> np.ndarray:
+    """Five different pictures, (5, 6, 8, 3)."""
+    return np.random.default_rng(1).integers(0, 256, (5, 6, 8, 3), dtype=np.uint8)
+
+
+# Policies whose walks can be foretold.
+
+
+class Guide(TensorDictModuleBase):
+    """Walks the shortest path, the lowest action first."""
+
+    in_keys: ClassVar = ["state_id", "goal_id"]
+    out_keys: ClassVar = ["action"]
+
+    def __init__(self, scenes: SceneSet) -> None:
+        super().__init__()
+        self.scenes = scenes
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        reached = self.scenes.successor[tensordict["state_id"][..., -1]]
+        left = self.scenes.distance(reached, tensordict["goal_id"].unsqueeze(-1))
+        left = torch.where(left < 0, 10**6, left)
+        return tensordict.set("action", left.argmin(-1))
+
+
+class Turner(TensorDictModuleBase):
+    """Does the same thing all the time."""
+
+    in_keys: ClassVar = ["state_id"]
+    out_keys: ClassVar = ["action"]
+
+    def __init__(self, action: int) -> None:
+        super().__init__()
+        self.action = action
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        return tensordict.set("action", torch.full_like(tensordict["goal_id"], self.action))
+
+
+class Dice(TensorDictModuleBase):
+    """Walks at random; counts the rows that it was asked about."""
+
+    in_keys: ClassVar = ["state_id"]
+    out_keys: ClassVar = ["action"]
+    rows = 0
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        self.rows += tensordict.numel()
+        return tensordict.set("action", torch.randint(4, tensordict.shape))
+
+
+class Counter(TensorDictModuleBase):
+    """Has a memory: forward on every third step of its own counting, else it turns right."""
+
+    in_keys: ClassVar = ["state_id", "count", "is_init"]
+    out_keys: ClassVar = ["action", ("next", "count")]
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        count = tensordict.get("count", torch.zeros(*tensordict.shape, 1, dtype=torch.int64))
+        assert torch.equal(tensordict["is_init"], count == 0)
+        tensordict["action"] = torch.where(count.squeeze(-1) % 3 == 2, 0, 1)
+        tensordict["next", "count"] = count + 1
+        return tensordict
+
+
+@pytest.fixture
+def rooms(make_scene: Callable[..., Scene]) -> SceneSet:
+    """Two rooms, 16 and 24 states."""
+    return SceneSet([make_scene("hall"), make_scene("attic", width=3)])
+
+
+@pytest.fixture
+def island(make_scene: Callable[..., Scene]) -> SceneSet:
+    """A corridor of 4 states (the last a trap that one enters and never leaves) and a state that none
+    enters."""
+    graph = torch.tensor([[1, -1], [2, 0], [3, 1], [-1, -1], [0, -1]])
+    return SceneSet([Scene("trap", graph, torch.rand(5, 1, 4))])
+
+
+@pytest.fixture
+def guide(rooms: SceneSet) -> Guide:
+    return Guide(rooms)
+
+
+@pytest.fixture
+def policies() -> dict[str, type]:
+    return {"guide": Guide, "turner": Turner, "dice": Dice, "counter": Counter}

@@ -1,3 +1,7 @@
 """Target-driven visual navigation with universal successor features, as TorchRL components."""
 
+from vusfa.deprecated import install
+
 __version__ = "0.1.0"
+
+install()

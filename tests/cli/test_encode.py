@@ -10,8 +10,9 @@ import pytest
 import torch
 
 from vusfa.errors import ConfigError
-from vusfa.scenes import Scene, backbones
-from vusfa.scenes.encode import encode_scene
+from vusfa.scenes import Scene
+from vusfa.sources import backbones
+from vusfa.sources.encode import encode_scene
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*torch.jit:DeprecationWarning")
 
@@ -78,7 +79,7 @@ def test_a_run_that_was_stopped_says_what_was_there(
 def test_bfloat16_that_is_not_as_good_is_said(
     run: Callable[..., Any], scene_file: Path, network: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("vusfa.scenes.encode.bfloat16_is_as_good", lambda pictures, backbone: False)
+    monkeypatch.setattr("vusfa.sources.encode.bfloat16_is_as_good", lambda pictures, backbone: False)
     target = scene_file.with_name("new.h5")
     result = run("encode", scene_file, target, "--backbone", network, "--bfloat16")
     assert result.exit_code == 0

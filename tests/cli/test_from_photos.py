@@ -12,10 +12,11 @@ import pytest
 import torch
 from PIL import Image
 
-from vusfa.scenes import Scene, backbones, validate
-from vusfa.scenes.backbones import Backbone
-from vusfa.scenes.crops import Preprocessing
+from vusfa.scenes import Scene, validate
 from vusfa.scenes.provenance import Provenance
+from vusfa.sources import backbones
+from vusfa.sources.backbones import Backbone
+from vusfa.sources.crops import Preprocessing
 
 Run = Callable[..., Any]
 
@@ -123,7 +124,7 @@ def test_stopped_while_it_encodes_it_goes_on(
     run: Run, flat: Path, mean_colour: Callable[[], int], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     """Ctrl-C after 96 pictures; then the rest alone; the file is the same as in one go."""
-    from vusfa.scenes.row_log import RowLog
+    from vusfa.sources.row_log import RowLog
 
     monkeypatch.setenv("SOURCE_DATE_EPOCH", "0")
     run("from-photos", flat, "-o", "whole.h5")

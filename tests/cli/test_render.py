@@ -8,8 +8,8 @@ from typing import Any
 
 import pytest
 
-from vusfa.scenes.render import Rendered, layout, load_plan, room, save_plan
-from vusfa.scenes.render.backend import Backend
+from vusfa.sources.render import Rendered, layout, load_plan, room, save_plan
+from vusfa.sources.render.backend import Backend
 
 
 def test_plan_only_writes_the_plan_that_the_seed_draws(run: Callable[..., Any], tmp_path: Path) -> None:
@@ -67,7 +67,7 @@ def test_the_renderer_gets_the_plan_and_its_progress_is_told(
         return Rendered(out, 2, "chalk", 0.25, 0.5)
 
     monkeypatch.setattr(room, "render_room", render)
-    monkeypatch.setattr("vusfa.scenes.backbones.load_backbone", lambda name, weights: (name, weights))
+    monkeypatch.setattr("vusfa.sources.backbones.load_backbone", lambda name, weights: (name, weights))
     monkeypatch.setattr("vusfa.cli.progress._BRIEF", 0.0, raising=False)
     result = run("render", "--plan", tmp_path / "bath.yaml", "-o", tmp_path / "bath.h5", "--threads", 1)
     assert result.exit_code == 0, result.stderr

@@ -11,6 +11,7 @@ from typing import Any
 import pytest
 from omegaconf import DictConfig, OmegaConf
 
+from vusfa.conf import FOLDER as CONF
 from vusfa.training.launch import compose
 
 RECIPES = Path(__file__).parents[2] / "recipes"
@@ -50,7 +51,7 @@ def settings() -> Callable[..., DictConfig]:
     """Settings as the command line would make them, interpolations resolved."""
 
     def made(*overrides: str, name: str = "train") -> DictConfig:
-        cfg = compose(RECIPES / "conf", name, overrides)
+        cfg = compose(CONF, name, overrides)
         OmegaConf.resolve(cfg)
         return cfg
 

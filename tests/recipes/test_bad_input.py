@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import torch
 
+from vusfa.conf import FOLDER as CONF
 from vusfa.scenes import Scene
 from vusfa.training.launch import launch
 
@@ -29,7 +30,7 @@ def run(recipe, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.C
     def launched(*arguments: str) -> str:
         monkeypatch.setattr("sys.argv", ["train.py", *arguments])
         with pytest.raises(SystemExit) as end:
-            launch(module.main, RECIPES / "conf", "train")
+            launch(module.main, CONF, "train")
         out, err = capfd.readouterr()
         assert end.value.code == 2, err
         assert list(work.rglob("*")) == []
@@ -157,7 +158,7 @@ def test_a_documented_null_is_taken(
     arguments = [*small, "total_frames=48", f"folder={tmp_path / 'run'}", f"{key}=null"]
     monkeypatch.setattr("sys.argv", ["train.py", *arguments])
     with pytest.raises(SystemExit) as end:
-        launch(recipe("train").main, RECIPES / "conf", "train")
+        launch(recipe("train").main, CONF, "train")
     assert end.value.code == 0, capfd.readouterr().err
 
 

@@ -9,9 +9,10 @@ from pathlib import Path
 import pytest
 from omegaconf import OmegaConf
 
+from vusfa.conf import FOLDER as CONF
 from vusfa.training.launch import compose
 
-CONF = Path(__file__).parents[2] / "recipes" / "conf"
+RECIPES = Path(__file__).parents[2] / "recipes"
 FILES = sorted(CONF.rglob("*.yaml"))
 
 
@@ -21,7 +22,7 @@ def test_every_file_opens_with_the_line_that_launches_it(path: Path):
     assert lines[0].startswith("# ")
     command = shlex.split(lines[0].rpartition("python recipes/")[2])
     recipe, overrides = command[0], command[1:]
-    assert (CONF.parent / recipe).is_file()
+    assert (RECIPES / recipe).is_file()
     compose(CONF, Path(recipe).stem, overrides)
     group = path.relative_to(CONF).parent
     if group != Path() and path.stem != "index":
@@ -31,7 +32,7 @@ def test_every_file_opens_with_the_line_that_launches_it(path: Path):
 
 
 def test_the_groups_mirror_the_package():
-    assert {path.name for path in CONF.iterdir() if path.is_dir()} == {
+    assert {path.name for path in CONF.iterdir() if path.is_dir() and path.name != "__pycache__"} == {
         "agent",
         "collector",
         "env",

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from vusfa.conf import FOLDER as CONF
 from vusfa.training.launch import compose
 
 ROOT = Path(__file__).parents[2]
@@ -40,4 +41,4 @@ def test_a_recipe_line_is_one_that_works(recipe, line: str):
         key, _, values = override.partition("=")
         # a sweep is several command lines
         for value in values.split(",") if "--multirun" in arguments else [values]:
-            compose(ROOT / "recipes" / "conf", name, [f"{key}={value}"])
+            compose(CONF, name, [f"{key}={value}"])

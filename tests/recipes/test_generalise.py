@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from vusfa.errors import SceneError
-from vusfa.evaluation.results import read_cell
+from vusfa.experiments.results import read_cell
 from vusfa.scenes import Scene
 
 SMALL = [

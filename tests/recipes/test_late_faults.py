@@ -11,9 +11,10 @@ from pathlib import Path
 import pytest
 import torch
 
+from vusfa.conf import FOLDER as CONF
 from vusfa.errors import CheckpointError, ConfigError, GoalError
 from vusfa.evaluation import check_comparison
-from vusfa.evaluation.files import check_folder
+from vusfa.files import check_folder
 from vusfa.scenes import Scene, SceneSet
 from vusfa.training import load_checkpoint, make_loggers
 from vusfa.training.launch import launch, with_saved_overrides
@@ -38,7 +39,7 @@ def run(recipe, work: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.Captu
         monkeypatch.setattr("sys.argv", [f"{name}.py", *arguments])
         module = recipe(name)
         with pytest.raises(SystemExit) as end:
-            launch(module.main if name == "train" else module.demo, RECIPES / "conf", name)
+            launch(module.main if name == "train" else module.demo, CONF, name)
         return end.value.code, capfd.readouterr().err
 
     return launched

@@ -12,11 +12,12 @@ import numpy as np
 import pytest
 import torch
 
-from vusfa.scenes import Scene, thor
-from vusfa.scenes.backbones import Backbone
-from vusfa.scenes.crops import Preprocessing
-from vusfa.scenes.encode import encode_scene
-from vusfa.scenes.render import flat, render_room
+from vusfa.scenes import Scene
+from vusfa.sources import thor
+from vusfa.sources.backbones import Backbone
+from vusfa.sources.crops import Preprocessing
+from vusfa.sources.encode import encode_scene
+from vusfa.sources.render import flat, render_room
 
 THUMBNAIL = Backbone(
     "thumbnail", "pixels", "", Preprocessing(size=4), lambda images: images.flatten(1).clone()

@@ -11,8 +11,8 @@ import pytest
 import torch
 
 from vusfa.envs import resolve_goals
-from vusfa.evaluation.manifest import make_manifest, write_manifest
-from vusfa.evaluation.results import read_cell, read_cells, write_cell
+from vusfa.experiments.manifest import make_manifest, write_manifest
+from vusfa.experiments.results import read_cell, read_cells, write_cell
 from vusfa.scenes import SceneSet
 
 SMALL = [

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from vusfa.errors import CheckpointError, VusfaError
-from vusfa.evaluation.results import Cell, read_cell, write_cell
+from vusfa.experiments.results import Cell, read_cell, write_cell
 
 
 @pytest.fixture

@@ -13,8 +13,8 @@ import torch
 
 from vusfa.envs import resolve_goals
 from vusfa.errors import ResultError
-from vusfa.evaluation.manifest import make_manifest, write_manifest
-from vusfa.evaluation.results import read_cell
+from vusfa.experiments.manifest import make_manifest, write_manifest
+from vusfa.experiments.results import read_cell
 from vusfa.scenes import SceneSet
 
 ZERO_SHOT = Path(__file__).parents[2] / "recipes" / "zero_shot.py"

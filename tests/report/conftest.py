@@ -14,6 +14,7 @@ import pytest
 import torch
 from omegaconf import OmegaConf
 
+from vusfa.conf import FOLDER as CONF
 from vusfa.evaluation import Episodes
 from vusfa.report import Options, read_run, write_report
 from vusfa.report.runs import Run
@@ -45,7 +46,7 @@ def train_run() -> Callable[[Path, list[str]], Path]:
             "evaluation.max_steps=20",
             *options,
         ]
-        cfg = compose(RECIPES / "conf", "train", overrides)
+        cfg = compose(CONF, "train", overrides)
         OmegaConf.resolve(cfg)
         train(cfg, overrides)
         return folder

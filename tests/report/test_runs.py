@@ -13,7 +13,7 @@ import torch
 
 from vusfa.errors import ConfigError, ResultError
 from vusfa.evaluation.exact import ExactGoals
-from vusfa.evaluation.results import Cell, write_cell
+from vusfa.experiments.results import Cell, write_cell
 from vusfa.report import read_run, read_source
 from vusfa.report.runs import read_curves, read_episodes
 

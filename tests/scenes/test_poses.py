@@ -10,8 +10,8 @@ import torch
 
 from vusfa.scenes import Scene
 from vusfa.scenes.poses import places, spread_poses, step_length
-from vusfa.scenes.sheet import draw_floor, draw_sheet, save_sheet
-from vusfa.scenes.summary import summarise
+from vusfa.sources.sheet import draw_floor, draw_sheet, save_sheet
+from vusfa.sources.summary import summarise
 
 
 @pytest.mark.parametrize(("width", "height"), [(1, 1), (5, 1), (3, 4)])

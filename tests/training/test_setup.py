@@ -10,11 +10,11 @@ import pytest
 import torch
 from omegaconf import OmegaConf
 
+from vusfa.conf import FOLDER as CONF
 from vusfa.errors import ConfigError, VusfaError
 from vusfa.training import Training, make_training
 from vusfa.training.launch import compose
 
-CONF = Path(__file__).parents[2] / "recipes" / "conf"
 SMALL = [
     "env.goals=[3,9,12]",
     "agent.hidden_size=8",

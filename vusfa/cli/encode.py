@@ -82,8 +82,8 @@ def encode(
         vusfa scenes encode room.h5 room_ten.h5 --crops ten --batch 8
     """
     from vusfa.cli.resumed import resumed
-    from vusfa.scenes.backbones import load_backbone
-    from vusfa.scenes.encode import encode_scene
+    from vusfa.sources.backbones import load_backbone
+    from vusfa.sources.encode import encode_scene
 
     options = network_options(crops=crops, size=size, resize=resize, mean=mean, std=std)
     network = load_backbone(backbone, weights=weights, layer=layer, device=device, **options)

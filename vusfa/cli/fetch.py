@@ -39,8 +39,8 @@ def fetch(
     """
     from vusfa.cli.resumed import resumed
     from vusfa.errors import ConfigError
-    from vusfa.scenes.fetch import archives
-    from vusfa.scenes.fetch import fetch as fetch_archive
+    from vusfa.sources.fetch import archives
+    from vusfa.sources.fetch import fetch as fetch_archive
 
     known = archives(config)
     if name not in known:

@@ -13,7 +13,7 @@ from vusfa.errors import SceneError
 
 if TYPE_CHECKING:
     from vusfa.scenes import Scene
-    from vusfa.scenes.summary import Summary
+    from vusfa.sources.summary import Summary
 
 __all__ = ["register"]
 
@@ -56,7 +56,7 @@ def list_scenes(
     from vusfa.cli.tables import print_wide, table_of_groups, table_of_scenes
     from vusfa.scenes import Scene, bundled_names
     from vusfa.scenes.store import bundled_path
-    from vusfa.scenes.summary import by_name, summarise
+    from vusfa.sources.summary import by_name, summarise
 
     bundled = {name: bundled_path(name) for name in bundled_names()}
     paths = _find(sources, bundled)
@@ -152,8 +152,8 @@ def show(
         vusfa scenes show my_room.h5 -o my_room.png --pictures 20
     """
     from vusfa.scenes import SceneSet
-    from vusfa.scenes.sheet import save_sheet
-    from vusfa.scenes.summary import summarise
+    from vusfa.sources.sheet import save_sheet
+    from vusfa.sources.summary import summarise
 
     (loaded,) = SceneSet.open(scene).scenes
     for line in _description(loaded, summarise(loaded)):
@@ -240,7 +240,7 @@ def compare(
         vusfa scenes compare my_bathroom.h5 bathroom
     """
     from vusfa.scenes import SceneSet
-    from vusfa.scenes.compare import compare as compare_scenes
+    from vusfa.sources.compare import compare as compare_scenes
 
     found = compare_scenes(SceneSet.open(scene).scenes[0], SceneSet.open(other).scenes[0])
     say = {True: "equal", False: "different"}

@@ -84,8 +84,8 @@ def from_photos(
 
     from vusfa.cli.progress import progress
     from vusfa.scenes import Scene
-    from vusfa.scenes.photos import lay_out, read_features, read_photos
     from vusfa.scenes.provenance import Provenance, this_tool, today
+    from vusfa.sources.photos import lay_out, read_features, read_photos
 
     target = output or Path(f"{folder.resolve().name}.h5")
     if target.exists() and not force:
@@ -140,7 +140,7 @@ def _size(size: str) -> tuple[int, int]:
 
 def _network(backbone: str, weights: Path | None) -> Any:
     """The network; asked for before the pictures are read, so that a missing one is said at once."""
-    from vusfa.scenes.backbones import load_backbone
+    from vusfa.sources.backbones import load_backbone
 
     return load_backbone(backbone, weights=weights)
 
@@ -153,7 +153,7 @@ def _encode(
     from PIL import Image
 
     from vusfa.cli.resumed import resumed
-    from vusfa.scenes.encode import encode_in_steps
+    from vusfa.sources.encode import encode_in_steps
 
     def read(first: int, last: int) -> np.ndarray:
         some = [

@@ -10,7 +10,7 @@ import typer
 from vusfa.errors import ConfigError, SceneError
 
 if TYPE_CHECKING:
-    from vusfa.scenes.render.plan import Plan
+    from vusfa.sources.render.plan import Plan
 
 __all__ = ["register"]
 
@@ -21,9 +21,9 @@ def register(scenes: typer.Typer) -> None:
 
 
 def _plan(plan: Path | None, kind: str | None, flat: str | None, seed: int, cells: int | None) -> Plan:
-    from vusfa.scenes.render.flat import flat as draw_flat
-    from vusfa.scenes.render.layout import layout
-    from vusfa.scenes.render.plan_file import load_plan
+    from vusfa.sources.render.flat import flat as draw_flat
+    from vusfa.sources.render.layout import layout
+    from vusfa.sources.render.plan_file import load_plan
 
     if sum(given is not None for given in (plan, kind, flat)) != 1:
         raise ConfigError("say what to render: --plan FILE, --kind KIND or --flat KIND,KIND,...")
@@ -88,8 +88,8 @@ def render(
 
         vusfa scenes render --flat kitchen,hall,bedroom,bathroom --cells 500
     """
-    from vusfa.scenes.render.grid import poses
-    from vusfa.scenes.render.plan_file import save_plan
+    from vusfa.sources.render.grid import poses
+    from vusfa.sources.render.plan_file import save_plan
 
     name = plan.stem if plan is not None else f"{kind or 'flat'}-{seed}"
     target = output or Path(f"{name}.yaml" if plan_only else f"{name}.h5")
@@ -97,7 +97,7 @@ def render(
         raise SceneError(f"{target}: exists; choose another name with -o, or replace it with --force")
     room = _plan(plan, kind, flat, seed, cells)
     if plan_only:
-        from vusfa.scenes.render.catalogue import Catalogue
+        from vusfa.sources.render.catalogue import Catalogue
 
         if not room.is_complete:
             room = room.completed(Catalogue.open())
@@ -109,9 +109,9 @@ def render(
         return
 
     from vusfa.cli.resumed import resumed
-    from vusfa.scenes.backbones import load_backbone
-    from vusfa.scenes.render.backend import Backend
-    from vusfa.scenes.render.room import render_room
+    from vusfa.sources.backbones import load_backbone
+    from vusfa.sources.render.backend import Backend
+    from vusfa.sources.render.room import render_room
 
     network = load_backbone(backbone, weights=weights)
     with resumed("rendering", "frames") as frames, resumed("encoding", "pictures") as features:

@@ -9,7 +9,7 @@ from rich.table import Table
 from rich.text import Text
 
 from vusfa.errors import SceneError
-from vusfa.scenes.summary import Group, Summary
+from vusfa.sources.summary import Group, Summary
 
 __all__ = ["print_wide", "table_of_groups", "table_of_scenes"]
 

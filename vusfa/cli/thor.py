@@ -50,8 +50,8 @@ def export_thor(
     """
     from vusfa.cli.resumed import resumed
     from vusfa.errors import ConfigError
-    from vusfa.scenes.backbones import load_backbone
-    from vusfa.scenes.thor import export
+    from vusfa.sources.backbones import load_backbone
+    from vusfa.sources.thor import export
 
     network = load_backbone(backbone, weights=weights, layer=layer, crops=crops)
     try:

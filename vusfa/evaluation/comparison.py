@@ -14,10 +14,10 @@ from torch import Tensor
 from vusfa.envs.goals import resolve_goals
 from vusfa.errors import ConfigError, GoalError
 from vusfa.evaluation.episodes import Episodes
-from vusfa.evaluation.files import write_csv, write_json
 from vusfa.evaluation.floors import shortest_paths
 from vusfa.evaluation.navigation import Unreachable, episode_starts, evaluate
 from vusfa.evaluation.report import count_pairs, random_walk_summary, summary
+from vusfa.files import write_csv, write_json
 from vusfa.scenes import SceneSet
 
 __all__ = ["Comparison", "check_comparison", "compare"]

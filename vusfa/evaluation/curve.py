@@ -7,7 +7,7 @@ import math
 from pathlib import Path
 
 from vusfa.errors import ConfigError
-from vusfa.evaluation.files import replacing
+from vusfa.files import replacing
 
 __all__ = ["plot_curve", "read_metrics"]
 

@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from vusfa.evaluation.files import write_csv
+from vusfa.files import write_csv
 
 __all__ = ["Episodes"]
 

@@ -13,7 +13,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from vusfa.envs import TargetNavEnv
 from vusfa.envs.rendering import draw_panels
 from vusfa.evaluation.episodes import Episodes
-from vusfa.evaluation.files import replacing
+from vusfa.files import replacing
 from vusfa.scenes import SceneSet
 
 __all__ = ["draw_film", "longest_success", "record_walk", "write_gif"]

@@ -119,7 +119,7 @@ def evaluate(
         goals: global state ids, or whatever :func:`vusfa.envs.goals.resolve_goals` takes.
         trained: global ids of the goals that the policy was trained on; they are marked in the table.
         episodes: starts and goals (n,), global ids, of a manifest
-            (:mod:`vusfa.evaluation.manifest`); then ``goals`` and what follows of draws are not looked at.
+            (:mod:`vusfa.experiments.manifest`); then ``goals`` and what follows of draws are not looked at.
         episodes_per_goal: episodes for each goal, from starts drawn uniformly.
         max_steps: actions allowed in an episode.
         history: frames H in ``state_id``.

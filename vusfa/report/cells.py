@@ -1,4 +1,4 @@
-"""Reads cells of results (:mod:`vusfa.evaluation.results`) as runs, and whatever a report is given."""
+"""Reads cells of results (:mod:`vusfa.experiments.results`) as runs, and whatever a report is given."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from vusfa.errors import ConfigError
-from vusfa.evaluation.results import read_cell
+from vusfa.experiments.results import read_cell
 from vusfa.modules.presets import MODELS
 from vusfa.report.runs import Run, read_curves, read_run, split_name
 

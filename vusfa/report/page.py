@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from vusfa.errors import ConfigError
-from vusfa.evaluation.files import replacing, write_csv
+from vusfa.files import replacing, write_csv
 
 __all__ = ["as_json", "even", "make_page", "page_weight", "write_page", "write_tables"]
 

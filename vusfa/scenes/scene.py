@@ -20,9 +20,9 @@ from torch import Tensor
 
 from vusfa.errors import SceneError
 from vusfa.scenes import store
-from vusfa.scenes.faults import DATASETS, array_faults, raise_faults
 from vusfa.scenes.graph import default_actions, narrow_distances, shortest_path_distances, weak_components
 from vusfa.scenes.pictures import read_pictures
+from vusfa.scenes.validation import DATASETS, array_faults, raise_faults
 
 __all__ = ["Scene"]
 

@@ -25,9 +25,9 @@ import numpy as np
 
 from vusfa.errors import SceneError
 from vusfa.scenes import pictures as picture_files
-from vusfa.scenes.faults import DATASETS, array_faults, raise_faults
 from vusfa.scenes.graph import default_actions
 from vusfa.scenes.hdf5 import dataset_in, opened, plain, replaced
+from vusfa.scenes.validation import DATASETS, array_faults, raise_faults
 
 __all__ = ["Dump", "bundled_names", "bundled_path", "compact", "read", "validate", "write"]
 
@@ -180,7 +180,7 @@ def write(
 
     Args:
         path: where to; replaced if it exists.
-        arrays: the datasets of :data:`vusfa.scenes.faults.DATASETS`.
+        arrays: the datasets of :data:`vusfa.scenes.validation.DATASETS`.
         name: the scene's name.
         actions: A names.
         attributes: provenance.

@@ -32,7 +32,7 @@ import numpy as np
 import torch
 
 from vusfa.errors import CheckpointError
-from vusfa.evaluation.files import replacing
+from vusfa.files import replacing
 from vusfa.scenes import SceneSet
 
 __all__ = [

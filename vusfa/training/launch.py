@@ -7,7 +7,7 @@ The one part of this package that needs Hydra (extra ``recipes``). A recipe is a
         return 0
 
     if __name__ == "__main__":
-        launch(main, Path(__file__).parent / "conf", "train")
+        launch(main, CONF, "train")
 """
 
 from __future__ import annotations

@@ -14,7 +14,7 @@ from types import TracebackType
 from typing import Any, Protocol
 
 from vusfa.errors import ConfigError
-from vusfa.evaluation.files import write_csv, write_json
+from vusfa.files import write_csv, write_json
 
 __all__ = ["CSVLogger", "Logger", "Loggers", "TensorBoardLogger", "WandbLogger", "flat", "make_loggers"]
 

@@ -153,7 +153,7 @@ def make_training(
     """All parts of a training, from the settings of ``recipes/train.py``.
 
     Args:
-        settings: as in recipes/conf/train.yaml, plain and resolved.
+        settings: as in vusfa/conf/train.yaml, plain and resolved.
         overrides: the command line that made them, for whoever resumes.
         scenes: the world; opened as the settings say when not given.
 

@@ -1,0 +1,38 @@
+from __future__ import annotations
+
+import pytest
+import torch
+
+from vusfa.errors import ResultError
+from vusfa.evaluation import Episodes
+from vusfa.evaluation.exact import ExactGoals
+from vusfa.experiments.results import Cell
+from vusfa.experiments.unseen import unseen_table
+
+
+def cell(seed: int, lengths: list[int]) -> Cell:
+    """Two goals of two episodes each, five actions away; 500 is a failure."""
+    length = torch.tensor(lengths)
+    goal = torch.tensor([3, 3, 8, 8])
+    zero = torch.zeros(4, dtype=torch.int64)
+    table = Episodes(zero, goal, zero, length < 500, length, zero + 5, zero, zero > 0, ("hall",), 500)
+    half = torch.tensor([0.25, 0.5], dtype=torch.float64)
+    walk = ExactGoals(torch.zeros(2).long(), torch.tensor([3, 8]), half, 2 * half, half / 5)
+    return Cell("generalise", f"vusfa-{seed}", {"tested_in": ["hall"]}, {"agent": table}, walk)
+
+
+def test_by_hand() -> None:
+    lines = unseen_table([cell(0, [5, 10, 200, 500]), cell(1, [5, 50, 20, 100])]).splitlines()
+    agent, walk = ([part.strip().split(" ")[0] for part in line.split("|")[1:-1]] for line in lines[2:])
+    spl = 100 * (1 + 0.5 + 0.025 + 0 + 1 + 0.1 + 0.25 + 0.05) / 8
+    assert agent == ["agent", "2", "87.5", "75.0", f"{spl:.1f}", "37.5"]
+    assert walk == ["random", "–", "75.0", "37.5", "7.5", "–"]
+
+
+def test_what_cannot_be_shown() -> None:
+    with pytest.raises(ResultError, match="run it first"):
+        unseen_table([])
+    other = cell(1, [5, 5, 5, 5])
+    other.info["tested_in"][0] = "attic"
+    with pytest.raises(ResultError, match="different rooms"):
+        unseen_table([cell(0, [5, 5, 5, 5]), other])

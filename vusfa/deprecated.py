@@ -1,0 +1,107 @@
+"""Old names of modules and objects: they work for one release and warn with the new name.
+
+One table for modules, one for objects of modules that still exist. Both are data: to move something, move it
+and add a line here.
+"""
+
+from __future__ import annotations
+
+import importlib
+import sys
+import warnings
+from collections.abc import Callable, Mapping, Sequence
+from importlib.abc import Loader, MetaPathFinder
+from importlib.machinery import ModuleSpec
+from types import ModuleType
+from typing import Any
+
+__all__ = ["MOVED_MODULES", "install", "moved_names"]
+
+#: Modules of version 0.1 and what they are called now.
+MOVED_MODULES: dict[str, str] = {
+    "vusfa.evaluation.files": "vusfa.files",
+    "vusfa.scenes.faults": "vusfa.scenes.validation",
+    "vusfa.training.cells": "vusfa.experiments.cells",
+    "vusfa.training.transfer": "vusfa.experiments.fine_tune",
+    **{
+        f"vusfa.evaluation.{name}": f"vusfa.experiments.{name}"
+        for name in ("experiment", "tables", "results", "transfer", "transfer_figure", "unseen", "manifest")
+    },
+    **{
+        f"vusfa.scenes.{name}": f"vusfa.sources.{name}"
+        for name in (
+            "backbones", "crops", "download", "encode", "fetch", "grid", "photo_tables", "photos", "row_log",
+            "thor", "sheet", "compare", "summary", "render",
+        )
+    },
+}  # fmt: skip
+
+
+class _Moved(MetaPathFinder, Loader):
+    """Finds a module under its old name, and warns."""
+
+    def __init__(self) -> None:
+        self._specs: dict[str, ModuleSpec | None] = {}
+
+    def find_spec(
+        self, fullname: str, path: Sequence[str] | None, target: ModuleType | None = None
+    ) -> ModuleSpec | None:
+        return ModuleSpec(fullname, self) if _new_name(fullname) else None
+
+    def create_module(self, spec: ModuleSpec) -> ModuleType:
+        new = _new_name(spec.name)
+        assert new is not None
+        warnings.warn(
+            f"{spec.name} is called {new} since version 0.2; the old name goes with version 0.3",
+            DeprecationWarning,
+            stacklevel=2,
+        )
+        module = importlib.import_module(new)
+        self._specs[spec.name] = module.__spec__
+        return module
+
+    def exec_module(self, module: ModuleType) -> None:
+        """Put back the module's own specification; it has been run already, under its new name."""
+        assert module.__spec__ is not None
+        module.__spec__ = self._specs.pop(module.__spec__.name)
+
+
+def _new_name(old: str) -> str | None:
+    for before, now in MOVED_MODULES.items():
+        if old == before or old.startswith(before + "."):
+            return now + old.removeprefix(before)
+    return None
+
+
+def install() -> None:
+    """Let old names of modules be imported; :mod:`vusfa` does this once."""
+    if not any(isinstance(finder, _Moved) for finder in sys.meta_path):
+        sys.meta_path.insert(0, _Moved())  # before a moved package finds its modules under both names
+
+
+def moved_names(module: str, names: Mapping[str, str]) -> Callable[[str], Any]:
+    """A module's ``__getattr__`` that finds objects under their old names, and warns.
+
+    Args:
+        module: name of the module that calls, ``__name__``.
+        names: old name of an object to the full new name of it, ``"package.module.Name"``.
+
+    >>> getattr_ = moved_names("vusfa.old", {"frobnicate": "math.sqrt"})
+    >>> with warnings.catch_warnings(record=True):
+    ...     warnings.simplefilter("always")
+    ...     getattr_("frobnicate")(9.0)
+    3.0
+    """
+
+    def find(name: str) -> Any:
+        if name not in names:
+            raise AttributeError(f"module {module!r} has no attribute {name!r}")
+        place, _, attribute = names[name].rpartition(".")
+        warnings.warn(
+            f"{module}.{name} is called {names[name]} since version 0.2; the old name goes with version 0.3",
+            DeprecationWarning,
+            stacklevel=2,
+        )
+        return getattr(importlib.import_module(place), attribute)
+
+    return find

@@ -1,0 +1,1 @@
+"""Experiments: manifests of episodes, results on disk, tables and figures made from them."""

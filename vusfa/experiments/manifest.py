@@ -1,0 +1,125 @@
+"""Which episodes everybody is evaluated on: scene, goal and start of each, and the seed of the actions.
+
+``manifests/bundled.npz`` is that of the bundled rooms: every state of every room a goal, ten starts each.
+Five goals of each room, none of them trained on, are set apart to choose checkpoints by (``validation``); no
+table counts them. :func:`make_manifest` makes the like for other rooms, and made this one.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from vusfa.envs.goals import resolve_goals
+from vusfa.errors import ResultError
+from vusfa.evaluation.navigation import episode_starts
+from vusfa.files import read_npz, replacing
+from vusfa.scenes import SceneSet
+
+__all__ = ["BUNDLED_MANIFEST", "Manifest", "make_manifest", "read_manifest", "write_manifest"]
+
+BUNDLED_MANIFEST = Path(__file__).parent / "manifests" / "bundled.npz"
+
+
+@dataclass(frozen=True, eq=False)
+class Manifest:
+    """Episodes; columns (n,) on the CPU.
+
+    Attributes:
+        start, goal: int64, global state ids in the set of scenes that it was made for.
+        validation: bool, an episode to choose checkpoints by.
+        seed: of the actions.
+        fingerprint: of the scenes.
+    """
+
+    start: Tensor
+    goal: Tensor
+    validation: Tensor
+    seed: int
+    fingerprint: str
+
+    def episodes(self, scenes: SceneSet, validation: bool = False) -> tuple[Tensor, Tensor]:
+        """Starts and goals (m,): those to report, or those to choose checkpoints by.
+
+        Raises:
+            ResultError: the scenes are not those it was made for.
+        """
+        if scenes.fingerprint != self.fingerprint:
+            raise ResultError(
+                f"the manifest of episodes is of other scenes (fingerprint {self.fingerprint[:12]}, and these"
+                f" have {scenes.fingerprint[:12]}); make one for these with make_manifest"
+            )
+        rows = self.validation == validation
+        return self.start[rows], self.goal[rows]
+
+
+def make_manifest(
+    scenes: SceneSet,
+    trained: Tensor,
+    *,
+    episodes_per_goal: int = 10,
+    validation_goals: int = 5,
+    seed: int = 0,
+) -> Manifest:
+    """Draw the episodes of a set of scenes.
+
+    Args:
+        scenes: the world.
+        trained: (G,) global ids of goals that are trained on, which are no validation goals.
+        episodes_per_goal: starts of each goal, drawn uniformly among those it can be reached from.
+        validation_goals: of each scene, drawn from its other states that can be reached.
+        seed: of all these draws, and of the actions.
+
+    >>> rooms = SceneSet.bundled(["bathroom"])
+    >>> manifest = make_manifest(rooms, torch.tensor([3]))
+    >>> len(manifest.goal), int(manifest.validation.sum()), 3 in manifest.goal[manifest.validation]
+    (1760, 50, False)
+    """
+    generator = torch.Generator().manual_seed(seed)
+    every = resolve_goals(scenes, "all")
+    chosen = []
+    for index in range(scenes.num_scenes):
+        here = every[(scenes.scene_id.cpu()[every] == index) & ~torch.isin(every, trained.cpu())]
+        chosen.append(here[torch.randperm(len(here), generator=generator)[:validation_goals]])
+    start, goal = episode_starts(scenes, every, episodes_per_goal, generator=generator)
+    return Manifest(start, goal, torch.isin(goal, torch.cat(chosen)), seed, scenes.fingerprint)
+
+
+def write_manifest(path: str | Path, manifest: Manifest) -> Path:
+    """Write a manifest (.npz), atomically; ids as 32-bit integers."""
+    columns = {name: getattr(manifest, name).numpy().astype(np.int32) for name in ("start", "goal")}
+    with replacing(path) as unfinished, open(unfinished, "wb") as file:
+        np.savez_compressed(
+            file,
+            allow_pickle=False,
+            start=columns["start"],
+            goal=columns["goal"],
+            validation=manifest.validation.numpy(),
+            seed=np.int64(manifest.seed),
+            fingerprint=np.array(manifest.fingerprint),
+        )
+    return Path(path)
+
+
+def read_manifest(path: str | Path = BUNDLED_MANIFEST) -> Manifest:
+    """Read a manifest; the bundled rooms' when none is named.
+
+    Raises:
+        ResultError: the file is missing or damaged.
+
+    >>> manifest = read_manifest()
+    >>> start, goal = manifest.episodes(SceneSet.bundled())
+    >>> len(goal), len(manifest.episodes(SceneSet.bundled(), validation=True)[0])
+    (16920, 200)
+    """
+    content = read_npz(path)
+    missing = {"start", "goal", "validation", "seed", "fingerprint"} - content.keys()
+    if missing:
+        raise ResultError(f"{path}: {sorted(missing)[0]!r} is missing; it is no manifest of episodes")
+    start, goal = (torch.from_numpy(content[name]).to(torch.int64) for name in ("start", "goal"))
+    validation = torch.from_numpy(content["validation"])
+    return Manifest(start, goal, validation, int(content["seed"]), str(content["fingerprint"]))

@@ -1,0 +1,299 @@
+"""The tables of an experiment: every number with its interval, beside the random walk and the shortest path.
+
+Rows are dictionaries; a number with an interval is an :class:`~vusfa.evaluation.statistics.Estimate`. Means
+are over goals, each of which weighs the same, unless a row says "mean of scenes".
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from functools import lru_cache
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from vusfa.evaluation.report import MEAN_OF_SCENES, MEAN_OF_STATES, SUBSETS
+from vusfa.evaluation.statistics import (
+    Draws,
+    Estimate,
+    Sums,
+    bootstrap_improvement,
+    bootstrap_iqm,
+    bootstrap_mean,
+    make_draws,
+    paired_difference,
+)
+from vusfa.experiments.experiment import RANDOM_WALK, SHORTEST_PATH, Experiment
+from vusfa.modules.presets import MODELS
+
+__all__ = [
+    "MEASURES",
+    "cell_rows",
+    "comparison_rows",
+    "distance_rows",
+    "flat_rows",
+    "markdown",
+    "middle_rows",
+    "model_rows",
+]
+
+Row = dict[str, Any]
+
+#: What a measure is called, and what it is multiplied by to be printed.
+MEASURES: dict[str, tuple[str, float, int]] = {
+    "success_500": ("success in 500, %", 100.0, 1),
+    "success_100": ("in 100, %", 100.0, 1),
+    "spl": ("SPL, %", 100.0, 1),
+    "soft_spl": ("soft-SPL, %", 100.0, 1),
+    "length_ratio": ("length / shortest", 1.0, 2),
+    "collisions": ("collisions", 1.0, 1),
+}
+COMPARED = ("success_500", "success_100", "spl")
+#: Trained goals count as solved from this share of their episodes on.
+SOLVED = 0.9
+_FROM = (0, 1, 3, 5, 8, 12)
+
+
+def cell_rows(experiment: Experiment) -> list[Row]:
+    """One row a cell: how long it was trained, whether it has solved the trained goals, and how far sampled
+    and exact success are apart.
+
+    Returns:
+        rows with model, seed, preset, frames, checkpoint, training_s, trained (success within 500), solved,
+        exact_z: the sampled success less the exact one in standard deviations. Starts are drawn uniformly,
+        so an episode to goal g succeeds with the chance p_g, and the deviation is that of
+        ``sum_g p_g (1 - p_g) / n_g``. NaN where there is no exact one.
+    """
+    rows = []
+    for label, cells in experiment.cells.items():
+        for cell in cells:
+            seed = int(cell.info["seed"])
+            found = experiment.sums(label, "sampled", [seed])["success_500"]
+            exact = experiment.sums(label, "exact", [seed]).get("success_500")
+            over, under = (part[0, experiment.trained].sum() for part in found)
+            reached = (over / under).item()
+            row = {"model": label, "seed": seed, "cell": f"{cell.experiment}/{cell.name}"}
+            row |= {key: cell.info.get(key) for key in ("frames", "checkpoint", "training_s", "cell_s")}
+            row |= {"trained": reached, "solved": reached >= SOLVED}
+            rows.append(row | {"exact_z": math.nan if exact is None else _deviations(found, exact)})
+    return rows
+
+
+def _deviations(sampled: Sums, exact: Sums) -> float:
+    chance, number = exact.numerator[0].clamp(0, 1), sampled.denominator[0]
+    variance = (number * chance * (1 - chance)).sum()
+    gap = (sampled.numerator[0] - number * chance).sum()
+    return (gap / variance.sqrt()).item() if variance > 0 else math.nan
+
+
+def model_rows(experiment: Experiment, way: str, resamples: int = 2000) -> list[Row]:
+    """One row for every model, subset of goals and scene, with both averages over the scenes; the random walk
+    and the shortest path among the models.
+
+    Args:
+        experiment: the cells.
+        way: ``sampled``, ``greedy`` or ``exact``.
+        resamples: of the bootstrap over seeds and goals.
+
+    Returns:
+        rows with way, goals, scene, model, seeds, num_goals and the measures that there are.
+    """
+    rows, draws = [], _cached_draws(resamples)
+    names = [scene.name for scene in experiment.scenes.scenes]
+    for subset, mask in _subsets(experiment).items():
+        places = [(name, mask & (experiment.scene == index)) for index, name in enumerate(names)]
+        places += [(MEAN_OF_SCENES, mask), (MEAN_OF_STATES, mask)]
+        for place, chosen in places:
+            head = {"way": way, "goals": subset, "scene": place}
+            by_scene = place == MEAN_OF_SCENES
+            rows += [
+                head | row for row in _rows_of(experiment, way, chosen, draws, by_scene) if bool(chosen.any())
+            ]
+    return rows
+
+
+def distance_rows(experiment: Experiment, way: str, resamples: int = 2000) -> list[Row]:
+    """One row for every model and distance of the goal from the nearest trained one, in actions.
+
+    Args:
+        experiment, way, resamples: see :func:`model_rows`.
+    """
+    rows, draws = [], _cached_draws(resamples)
+    for first, after in zip(_FROM, (*_FROM[1:], None), strict=True):
+        chosen = (experiment.away >= first) & (experiment.away < after if after else experiment.away >= 0)
+        words = (
+            f"{first} or more" if after is None else f"{first}–{after - 1}" if after - first > 1 else first
+        )
+        if bool(chosen.any()):
+            head = {"way": way, "distance": str(words)}
+            rows += [head | row for row in _rows_of(experiment, way, chosen, draws)]
+    return rows
+
+
+def middle_rows(experiment: Experiment, way: str, resamples: int = 2000) -> list[Row]:
+    """The interquartile mean over seeds and scenes, for every model and subset of goals.
+
+    Args:
+        experiment, way: see :func:`model_rows`.
+        resamples: of the bootstrap over seeds within scenes.
+    """
+    rows = []
+    for subset, mask in _subsets(experiment).items():
+        for label in experiment.cells:
+            sums = experiment.sums(label, way)
+            row: Row = {"way": way, "goals": subset, "model": label, "seeds": len(experiment.cells[label])}
+            for name in COMPARED:
+                if name in sums:
+                    scores = _scores(sums[name], experiment.scene, mask)
+                    row[name] = bootstrap_iqm(scores, resamples=resamples)
+            if sums:
+                rows.append(row)
+    return rows
+
+
+def comparison_rows(experiment: Experiment, way: str, resamples: int = 2000) -> list[Row]:
+    """Each model against the one before it, the last against the first, and all against the untrained network
+    and the random walk.
+
+    Args:
+        experiment, way, resamples: see :func:`model_rows`.
+
+    Returns:
+        rows with way, goals, measure, model, against, seeds (in common), difference (of pairs: same seeds,
+        same goals) and improvement (chance that a run of the model does better in a scene than one of the
+        other; none against the random walk).
+    """
+    four = [name for name in MODELS if name in experiment.cells]
+    pairs = [*zip(four[1:], four, strict=False)]
+    pairs += [(four[-1], four[0])] if len(four) > 2 else []
+    extra = [label for label in experiment.cells if label not in (*MODELS, "untrained")]
+    pairs += [(label, four[-1]) for label in extra if four]
+    pairs += [(name, "untrained") for name in four if "untrained" in experiment.cells]
+    pairs += [(label, RANDOM_WALK) for label in experiment.cells]
+    rows, draws = [], _cached_draws(resamples)
+    for subset, mask in _subsets(experiment).items():
+        for label, other in pairs:
+            seeds = experiment.seeds(label)
+            if other != RANDOM_WALK:
+                seeds = [seed for seed in seeds if seed in experiment.seeds(other)]
+            one, two = (experiment.sums(name, way, seeds) for name in (label, other))
+            for name in COMPARED if seeds else ():
+                if name in one and name in two:
+                    scene = experiment.scene[mask]
+                    first, second = (_masked(sums[name], mask) for sums in (one, two))
+                    drawn = draws(len(seeds), scene)
+                    row: Row = {
+                        "way": way,
+                        "goals": subset,
+                        "measure": name,
+                        "model": label,
+                        "against": other,
+                    }
+                    row |= {"seeds": len(seeds)}
+                    row["difference"] = paired_difference(first, second, scene, draws=drawn)
+                    if other != RANDOM_WALK:
+                        better, worse = (_scores(sums[name], experiment.scene, mask) for sums in (one, two))
+                        row["improvement"] = bootstrap_improvement(better, worse, resamples=resamples)
+                    rows.append(row)
+    return rows
+
+
+def flat_rows(rows: Iterable[Row]) -> list[Row]:
+    """Rows for CSV: an estimate becomes three columns, NAME, NAME_low and NAME_high; all rows get the same.
+
+    >>> flat_rows([{"model": "gvf", "spl": Estimate(0.5, 0.25, 0.75)}, {"model": "walk"}])[0]
+    {'model': 'gvf', 'spl': 0.5, 'spl_low': 0.25, 'spl_high': 0.75}
+    """
+    flat: list[Row] = []
+    for row in rows:
+        flat.append({})
+        for key, value in row.items():
+            named = zip(("", "_low", "_high"), value, strict=True) if isinstance(value, Estimate) else ()
+            flat[-1] |= {f"{key}{end}": number for end, number in named} or {key: value}
+    names = list(dict.fromkeys(name for row in flat for name in row))
+    return [{name: row.get(name, "") for name in names} for row in flat]
+
+
+def markdown(rows: Sequence[Row], columns: Sequence[str]) -> str:
+    """A table in Markdown; estimates as "value [low, high]", in the units of :data:`MEASURES`, and
+    differences of shares in percentage points.
+
+    Args:
+        rows: in order.
+        columns: those to show; one that no row has is left out.
+
+    >>> rows = [{"model": "gvf", "spl": Estimate(0.5, 0.25, 0.75)}, {"model": "walk"}]
+    >>> print(markdown(rows, ["model", "spl"]))
+    | model | SPL, % |
+    |---|---|
+    | gvf | 50.0 [25.0, 75.0] |
+    | walk | – |
+    """
+    shown = [name for name in columns if any(name in row for row in rows)]
+    heads = [MEASURES[name][0] if name in MEASURES else name.replace("_", " ") for name in shown]
+    lines = [f"| {' | '.join(heads)} |", "|" + "---|" * len(shown)]
+    lines += [f"| {' | '.join(_text(name, row.get(name)) for name in shown)} |" for row in rows]
+    return "\n".join(lines)
+
+
+def _text(name: str, value: Any) -> str:
+    _, scale, digits = MEASURES.get(name, ("", 100.0, 1))
+    if isinstance(value, Estimate):
+        low, high = (f"{scale * end:.{digits}f}" for end in value[1:])
+        ends = "" if math.isnan(value.low) else f" [{low}, {high}]"
+        return "–" if math.isnan(value.value) else f"{scale * value.value:.{digits}f}{ends}"
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if name == "trained" and isinstance(value, float):
+        return f"{100 * value:.1f}"
+    if isinstance(value, float):
+        return "–" if math.isnan(value) else f"{value:.1f}"
+    if isinstance(value, int):
+        return f"{value:,}"
+    return "–" if value is None else MEASURES[value][0] if value in MEASURES else str(value)
+
+
+def _subsets(experiment: Experiment) -> dict[str, Tensor]:
+    masks = (experiment.trained, ~experiment.trained, torch.ones_like(experiment.trained))
+    return {name: mask for name, mask in zip(SUBSETS, masks, strict=True) if bool(mask.any())}
+
+
+def _cached_draws(resamples: int) -> Any:
+    """Draws by number of seeds and goals' scenes, made once each."""
+    kept = lru_cache(maxsize=8)(
+        lambda seeds, scene: make_draws(seeds, torch.tensor(scene), resamples=resamples)
+    )
+
+    def draws(seeds: int, scene: Tensor) -> Draws:
+        return kept(seeds, tuple(scene.tolist()))
+
+    return draws
+
+
+def _rows_of(experiment: Experiment, way: str, mask: Tensor, draws: Any, by_scene: bool = False) -> list[Row]:
+    rows, scene = [], experiment.scene[mask]
+    for label in (*experiment.cells, RANDOM_WALK, SHORTEST_PATH):
+        sums = experiment.sums(label, way) if bool(mask.any()) else {}
+        if not sums:
+            continue
+        seeds = len(sums["success_500"].numerator) if label in experiment.cells else 0
+        row: Row = {"model": label, "seeds": seeds or "–", "num_goals": int(mask.sum())}
+        for name, table in sums.items():
+            part = _masked(table, mask)
+            drawn = draws(len(part.numerator), scene)
+            row[name] = bootstrap_mean(part, scene, by_scene=by_scene, draws=drawn)
+        rows.append(row)
+    return rows
+
+
+def _masked(sums: Sums, mask: Tensor) -> Sums:
+    return Sums(sums.numerator[:, mask], sums.denominator[:, mask])
+
+
+def _scores(sums: Sums, scene: Tensor, mask: Tensor) -> Tensor:
+    """(K, T): the means of each seed in each scene that has such goals."""
+    columns = [mask & (scene == index) for index in scene[mask].unique().tolist()]
+    parts = [_masked(sums, column) for column in columns]
+    return torch.stack([part.numerator.sum(1) / part.denominator.sum(1) for part in parts], 1)

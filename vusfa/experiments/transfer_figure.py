@@ -1,0 +1,166 @@
+"""The table and the picture of recipes/transfer.py, from its results alone."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import torch
+
+from vusfa.evaluation.statistics import Estimate, Sums, bootstrap_mean
+from vusfa.experiments.results import Cell
+from vusfa.experiments.transfer import KINDS, area_under, frames_to
+from vusfa.files import replacing
+
+__all__ = ["difference_table", "draw_transfer", "mean_over", "transfer_table"]
+
+WAYS = ("trained on", "from scratch")
+BOUNDS = ("random walk", "shortest path")
+PAIRS = (("usfa", "gvf"), ("sfdp", "usfa"), ("vusfa", "sfdp"), ("vusfa", "gvf"))
+_COLOURS = {"gvf": "#0072b2", "usfa": "#e69f00", "sfdp": "#009e73", "vusfa": "#cc79a7"}
+
+
+def mean_over(values: Sequence[Sequence[float]]) -> Estimate:
+    """The mean over seeds and sets of goals with its bootstrap interval; NaN drops out.
+
+    Args:
+        values: of each seed, of each set.
+
+    >>> mean_over([[1.0, 3.0], [1.0, 3.0]]).value
+    2.0
+    """
+    numbers = torch.tensor(values, dtype=torch.float64)
+    there = ~numbers.isnan()
+    sums = Sums(numbers.nan_to_num(), there.to(torch.float64))
+    return bootstrap_mean(sums, torch.zeros(numbers.shape[1], dtype=torch.int64))
+
+
+def transfer_table(
+    cells: Sequence[Cell], threshold: float, bounds: Mapping[str, Sequence[tuple[float, float]]] | None = None
+) -> str:
+    """Markdown: for each kind, model and way the mean length over the training, at its start and end, and the
+    frames to a threshold, each with its 95 % interval over seeds and sets of goals.
+
+    Args:
+        cells: of the experiment.
+        threshold: actions an episode.
+        bounds: of each kind, for each set of goals the length of a random walk and of the shortest path, see
+            :func:`~vusfa.experiments.transfer.walked_lengths`; a row each below the models.
+    """
+    bounds, kinds = bounds or {}, []
+    lines = [
+        "| new goals | model | | seeds | length, mean of the curve | at first | at last |"
+        f" frames to {threshold:g} | came there |",
+        "|---|---|---|---|---|---|---|---|---|",
+    ]
+    for kind, model, here in _groups(cells):
+        kinds += [] if kind in kinds else [kind]
+        for way in WAYS:
+            curves = [[entry[way] for entry in cell.info["curves"]] for cell in here]
+            area = mean_over([[area_under(c["frames"], c["length"]) for c in row] for row in curves])
+            first, last = (mean_over([[c["length"][end] for c in row] for row in curves]) for end in (0, -1))
+            to = [[frames_to(c["frames"], c["length"], threshold) for c in row] for row in curves]
+            arrived = sum(not math.isnan(value) for row in to for value in row)
+            total = sum(len(row) for row in to)
+            reached = _number(mean_over(to), 0) if arrived else "-"
+            lines.append(
+                f"| {kind} | {model} | {way} | {len(here)} | {_number(area)} | {_number(first)} |"
+                f" {_number(last)} | {reached} | {arrived} of {total} |"
+            )
+    for kind in kinds:
+        for index, name in enumerate(BOUNDS if kind in bounds else ()):
+            length = _number(mean_over([[pair[index] for pair in bounds[kind]]]))
+            lines.append(f"| {kind} | {name} | – | – | {length} | – | – | – | – |")
+    return "\n".join(lines)
+
+
+def difference_table(cells: Sequence[Cell]) -> str:
+    """Markdown: differences of the mean length over the training, paired by seed and set of goals, with 95 %
+    intervals: of each model trained on from the same model from scratch, and of neighbours trained on.
+
+    Less than 0: fewer actions than what it is compared with.
+
+    Args:
+        cells: of the experiment; of seeds that both sides of a pair have.
+    """
+    areas: dict[tuple[str, str, str], dict[int, list[float]]] = {}
+    for cell in cells:
+        for way in WAYS:
+            here = areas.setdefault((cell.info["kind"], cell.info["model"], way), {})
+            curves = [entry[way] for entry in cell.info["curves"]]
+            here[cell.info["seed"]] = [area_under(c["frames"], c["length"]) for c in curves]
+    lines = [
+        "| new goals | trained on | against | seeds | difference, mean of the curve |",
+        "|---|---|---|---|---|",
+    ]
+    for kind in KINDS:
+        models = [model for model in _COLOURS if (kind, model, WAYS[0]) in areas]
+        pairs = [((model, WAYS[0]), (model, WAYS[1])) for model in models]
+        pairs += [((a, WAYS[0]), (b, WAYS[0])) for a, b in PAIRS if a in models and b in models]
+        for one, other in pairs:
+            left, right = areas[(kind, *one)], areas[(kind, *other)]
+            seeds = sorted(left.keys() & right.keys())
+            if not seeds:
+                continue
+            paired = [[a - b for a, b in zip(left[s], right[s], strict=True)] for s in seeds]
+            against = other[0] if one[0] != other[0] else other[1]
+            lines.append(f"| {kind} | {one[0]} | {against} | {len(seeds)} | {_number(mean_over(paired))} |")
+    return "\n".join(lines)
+
+
+def draw_transfer(
+    cells: Sequence[Cell],
+    path: str | Path,
+    bounds: Mapping[str, Sequence[tuple[float, float]]] | None = None,
+) -> Path:
+    """Episode length against frames, a panel a kind of goals, with 95 % bands, the random walk and the
+    shortest path in grey (``bounds``, see :func:`transfer_table`); as PNG, atomically."""
+    from matplotlib.figure import Figure  # of the extra "recipes"
+
+    kinds = [kind for kind in KINDS if any(cell.info["kind"] == kind for cell in cells)]
+    figure = Figure(figsize=(4.2 * len(kinds), 4.6), layout="constrained")
+    panels = figure.subplots(1, len(kinds), sharey=True, squeeze=False)[0]
+    for kind, model, here in _groups(cells):
+        panel = panels[kinds.index(kind)]
+        for way, style in zip(WAYS, ("-", ":"), strict=True):
+            curves = [[entry[way] for entry in cell.info["curves"]] for cell in here]
+            frames = curves[0][0]["frames"]
+            points = [
+                mean_over([[c["length"][i] for c in row] for row in curves]) for i in range(len(frames))
+            ]
+            thousand = [frame / 1000 for frame in frames]
+            label = model if way == WAYS[0] else f"{model}, from scratch"
+            colour = _COLOURS.get(model, "#555555")
+            panel.plot(thousand, [p.value for p in points], style, color=colour, label=label)
+            panel.fill_between(
+                thousand, [p.low for p in points], [p.high for p in points], color=colour, alpha=0.15, lw=0
+            )
+        panel.set_title(f"new goals: {kind}")
+        panel.set_xlabel("thousand frames")
+    for kind, panel in zip(kinds, panels, strict=True):
+        for index, style in enumerate(("--", "-.") if kind in (bounds or {}) else ()):
+            height = mean_over([[pair[index] for pair in (bounds or {})[kind]]]).value
+            panel.axhline(height, linestyle=style, color="#777777", lw=1, label=BOUNDS[index])
+    panels[0].set_ylabel("actions an episode")
+    handles, labels = panels[-1].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=5, frameon=False, fontsize=8)
+    with replacing(path) as unfinished:
+        figure.savefig(unfinished, format="png", dpi=120)
+    return Path(path)
+
+
+def _groups(cells: Sequence[Cell]) -> list[tuple[str, str, list[Cell]]]:
+    models = [*_COLOURS, *sorted({cell.info["model"] for cell in cells} - _COLOURS.keys())]
+    groups = []
+    for kind in KINDS:
+        for model in models:
+            here = [cell for cell in cells if (cell.info["kind"], cell.info["model"]) == (kind, model)]
+            if here:
+                groups.append((kind, model, here))
+    return groups
+
+
+def _number(estimate: Estimate, digits: int = 1) -> str:
+    value, low, high = (f"{part:,.{digits}f}" for part in (estimate.value, estimate.low, estimate.high))
+    return f"{value} [{low}, {high}]"

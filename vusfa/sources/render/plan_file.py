@@ -1,0 +1,188 @@
+"""Plans as YAML: one line for each thing in the room, and every fault of a file named at once."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import types
+import uuid
+from pathlib import Path
+from typing import Any, Union, get_args, get_origin, get_type_hints
+
+import yaml
+
+from vusfa.errors import SceneError
+from vusfa.sources.render.faults import plan_faults
+from vusfa.sources.render.plan import Plan
+
+__all__ = ["from_yaml", "load_plan", "save_plan", "to_yaml"]
+
+
+class _Line(dict[str, Any]):
+    """A mapping written on one line."""
+
+
+class _Dumper(yaml.SafeDumper):
+    pass
+
+
+_Dumper.add_representer(
+    _Line, lambda dumper, value: dumper.represent_mapping("tag:yaml.org,2002:map", value, flow_style=True)
+)
+_Dumper.add_representer(
+    tuple, lambda dumper, value: dumper.represent_sequence("tag:yaml.org,2002:seq", value, flow_style=True)
+)
+
+
+def _plain(value: Any) -> Any:
+    """Dataclasses as mappings without the entries that have their default."""
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        entries = {}
+        for field in dataclasses.fields(value):
+            entry = getattr(value, field.name)
+            factory = field.default_factory
+            if entry != (field.default if factory is dataclasses.MISSING else factory()):
+                entries[field.name] = _plain(entry)
+        return _Line(entries)
+    if isinstance(value, tuple) and any(dataclasses.is_dataclass(item) for item in value):
+        return [_plain(item) for item in value]
+    return value
+
+
+def to_yaml(plan: Plan) -> str:
+    """The plan as YAML; :func:`from_yaml` gives an equal plan back.
+
+    >>> print(to_yaml(Plan("cell", size=(3.0, 2.0, 2.6))))
+    name: cell
+    size: [3.0, 2.0, 2.6]
+    <BLANKLINE>
+    """
+    entries = dict(_plain(plan))  # no longer on one line
+    return yaml.dump(entries, Dumper=_Dumper, sort_keys=False, width=400, allow_unicode=True)
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool)
+
+
+def _build(kind: Any, value: Any, where: str, faults: list[str]) -> Any:
+    """``value`` as the type ``kind``; what does not fit becomes a line in ``faults`` and None."""
+    origin = get_origin(kind)
+    if origin in (Union, types.UnionType):
+        wanted = next(option for option in get_args(kind) if option is not type(None))
+        return None if value is None else _build(wanted, value, where, faults)
+    if dataclasses.is_dataclass(kind):
+        return _build_entry(kind, value, where, faults)
+    if origin is tuple:
+        wanted = get_args(kind)
+        if not isinstance(value, list):
+            faults.append(f"{where}: {value!r} must be a list")
+            return None
+        if wanted[-1] is Ellipsis:
+            return tuple(_build(wanted[0], item, f"{where}[{k}]", faults) for k, item in enumerate(value))
+        if len(value) != len(wanted):
+            faults.append(f"{where}: {value!r} must have {len(wanted)} entries")
+            return None
+        return tuple(
+            _build(part, item, f"{where}[{k}]", faults)
+            for k, (part, item) in enumerate(zip(wanted, value, strict=True))
+        )
+    fits = {
+        float: _is_number,
+        int: lambda item: _is_number(item) and item == int(item),
+        str: lambda item: isinstance(item, str),
+        bool: lambda item: isinstance(item, bool),
+    }[kind]
+    try:
+        if fits(value):
+            return kind(value)
+    except (OverflowError, ValueError):  # infinity and NaN are no whole numbers
+        pass
+    names = {float: "a number", int: "a whole number", str: "text", bool: "true or false"}
+    faults.append(f"{where}: {value!r} must be {names[kind]}")
+    return None
+
+
+def _build_entry(kind: Any, value: Any, where: str, faults: list[str]) -> Any:
+    fields = {field.name: field for field in dataclasses.fields(kind)}
+    if not isinstance(value, dict):
+        faults.append(f"{where or 'the plan'}: must be a mapping with the keys {', '.join(fields)}")
+        return None
+    hints = get_type_hints(kind)
+    before = len(faults)
+    prefix = f"{where}." if where else ""
+    for key in value:
+        if key not in fields:
+            faults.append(f"{prefix}{key}: there is no such key; the keys are {', '.join(fields)}")
+    given = {
+        key: _build(hints[key], item, f"{prefix}{key}", faults)
+        for key, item in value.items()
+        if key in fields
+    }
+    for name, field in fields.items():
+        required = field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING
+        if required and name not in value:
+            faults.append(f"{prefix}{name}: is missing")
+    return kind(**given) if len(faults) == before else None
+
+
+def from_yaml(text: str, source: str = "plan") -> Plan:
+    """Read and check a plan.
+
+    Args:
+        text: the YAML.
+        source: what errors call it, such as its file's name.
+
+    Raises:
+        SceneError: it is no YAML, or has faults; the message lists every one of them.
+
+    >>> from_yaml("name: cell\\nsize: [3, 2]\\ngird: {step: 1}", "cell.yaml")
+    Traceback (most recent call last):
+    ...
+    vusfa.errors.SceneError: cell.yaml: 2 faults
+      - gird: there is no such key; the keys are name, size, kind, ...
+      - size: [3, 2] must have 3 entries
+    """
+    try:
+        content = yaml.safe_load(text)
+    except yaml.YAMLError as error:
+        raise SceneError(f"{source}: is no YAML ({error}); correct it") from error
+    faults: list[str] = []
+    plan = _build_entry(Plan, content, "", faults)
+    faults = faults or plan_faults(plan)
+    if len(faults) == 1:
+        raise SceneError(f"{source}: {faults[0]}")
+    if faults:
+        raise SceneError(f"{source}: {len(faults)} faults" + "".join(f"\n  - {fault}" for fault in faults))
+    return plan
+
+
+def load_plan(path: str | os.PathLike[str]) -> Plan:
+    """Read and check a plan's file.
+
+    Raises:
+        SceneError: there is no such file, or see :func:`from_yaml`.
+    """
+    path = Path(path)
+    try:
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise SceneError(f"{path}: cannot be read ({error}); give the file of a plan in YAML") from error
+    return from_yaml(text, str(path))
+
+
+def save_plan(plan: Plan, path: str | os.PathLike[str]) -> None:
+    """Write a plan's file, atomically.
+
+    Raises:
+        SceneError: it cannot be written.
+    """
+    path = Path(path)
+    temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex}.part")
+    try:
+        temporary.write_text(to_yaml(plan), encoding="utf-8")
+        temporary.replace(path)
+    except OSError as error:
+        raise SceneError(f"{path}: cannot be written ({error}); check folder, rights and space") from error
+    finally:
+        temporary.unlink(missing_ok=True)

@@ -1,0 +1,176 @@
+"""From a plan to a scene file: frames, features, graph, and whom to thank for the furniture.
+
+The work can be stopped at any moment and started again: finished frames and features lie beside the
+product, in hidden files that are removed when it is written.
+"""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+from vusfa.errors import SceneError
+from vusfa.scenes.graph import default_actions, shortest_path_distances
+from vusfa.scenes.provenance import Provenance, this_tool, today
+from vusfa.scenes.store import write
+from vusfa.scenes.validation import raise_faults
+from vusfa.sources.backbones import DEFAULT, Backbone, load_backbone
+from vusfa.sources.encode import encode_in_steps
+from vusfa.sources.render import backend as backends
+from vusfa.sources.render.catalogue import LICENCES, Catalogue
+from vusfa.sources.render.faults import plan_faults
+from vusfa.sources.render.frames import Frames
+from vusfa.sources.render.geometry import build_scene
+from vusfa.sources.render.grid import poses
+from vusfa.sources.render.plan import Plan
+from vusfa.sources.render.plan_file import to_yaml
+from vusfa.sources.render.renderer import Renderer
+from vusfa.sources.summary import look_alike_share
+
+__all__ = ["Rendered", "credits", "render_room"]
+
+#: ``progress(what, done, total)``: "frames" or "features"; first with what was done before.
+Progress = Callable[[str, int, int], None]
+
+
+@dataclass(frozen=True)
+class Rendered:
+    """What came of rendering a room.
+
+    Args:
+        path: the scene file.
+        states: N.
+        backend: what rendered it.
+        seconds_per_frame: of the frames rendered now; None when all were there from before.
+        look_alikes: share of states that some other state looks like (:mod:`vusfa.sources.summary`).
+    """
+
+    path: Path
+    states: int
+    backend: str
+    seconds_per_frame: float | None
+    look_alikes: float
+
+    def __str__(self) -> str:
+        rate = f", {self.seconds_per_frame:.2f} s a frame" if self.seconds_per_frame is not None else ""
+        return (
+            f"{self.path}: {self.states} states, {self.backend}{rate}; {100 * self.look_alikes:.1f} % of them"
+            f" look like another state"
+        )
+
+
+def credits(plan: Plan, catalogue: Catalogue) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Licences of the collections that a plan's models are from, and one line of credit for each model."""
+    models = [catalogue[name] for name in plan.models]
+    collections = sorted({model.collection for model in models})
+    licences = tuple(f"{name}: {LICENCES.get(name, 'licence unknown')}" for name in collections)
+    return licences, tuple(model.credit for model in models)
+
+
+def _attributes(
+    plan: Plan, catalogue: Catalogue, backend: backends.Backend, exposure: float
+) -> dict[str, Any]:
+    versions = {name: metadata.version(name) for name in ("mitsuba", "mitsuba-oidn", "trimesh")}
+    licences, thanks = credits(plan, catalogue)
+    origin = Provenance(
+        made_with=this_tool("scenes render", **versions),
+        made_on=today(),
+        plan=to_yaml(plan),
+        seed=plan.seed,
+        licences=licences,
+        credits=thanks,
+    )
+    return {
+        **origin.attributes(),
+        "kind": plan.kind or "room",
+        "models": [f"{name} {catalogue[name].title}" for name in plan.models],
+        "renderer": backend.variant,
+        "exposure": exposure,
+        "cell_m": plan.grid.step,
+        "agent_radius_m": plan.grid.radius,
+        "eye_m": plan.camera.height,
+        "hfov_deg": plan.camera.fov,
+        "spp": plan.camera.samples,
+        "frame": "location=(X right, Z forward); heading 0 = +Z, 90 = +X; RotateRight turns clockwise",
+    }
+
+
+def render_room(
+    plan: Plan,
+    out: str | os.PathLike[str],
+    progress: Progress | None = None,
+    *,
+    catalogue: Catalogue | None = None,
+    backbone: str | Backbone = DEFAULT,
+    backend: backends.Backend | None = None,
+    threads: int | None = None,
+    say: Callable[[str], None] | None = None,
+) -> Rendered:
+    """Render every pose of a plan and write the scene, atomically; called again it goes on where it was.
+
+    The same plan gives the same graph and poses, and with the same variant and versions the same pictures.
+
+    Args:
+        plan: the room.
+        out: scene file to write.
+        progress: told about frames, then features.
+        catalogue: furniture with its files; that of this machine when left out.
+        backbone: makes the features: a name for :func:`vusfa.sources.backbones.load_backbone`, or a network.
+        backend: Mitsuba's variant; the fastest that works when left out.
+        threads: how many threads render, on which pictures do not depend; when left out one for each core,
+            and one without LLVM.
+        say: told in a line which variant is used.
+
+    Raises:
+        SceneError: the plan has faults, furniture or packages are missing, or the file cannot be written.
+        ConfigError: the backbone or its weights are missing, or ``threads`` is below 1.
+    """
+    out = Path(out)
+    if not out.parent.is_dir():
+        raise SceneError(f"{out}: there is no folder {out.parent}; make it first")
+    raise_faults(f"plan {plan.name!r}", plan_faults(plan))
+    network = load_backbone(backbone) if isinstance(backbone, str) else backbone
+    catalogue = Catalogue.open() if catalogue is None else catalogue
+    plan = plan.completed(catalogue)
+    raise_faults(f"plan {plan.name!r}", plan_faults(plan))  # sizes from the catalogue may not fit the room
+    room = poses(plan)
+    backend = backends.choose_backend() if backend is None else backend
+    mi = backends.load_mitsuba(backend, threads)
+    (say or (lambda line: None))(f"{plan.name}: {room.num_states} states, rendering with {backend}")
+    report = progress or (lambda what, done, total: None)
+    versions = {name: metadata.version(name) for name in ("mitsuba", "mitsuba-oidn")}
+    frames = Frames(plan, room, out, {"variant": backend.variant, **versions})
+    began = time.monotonic()
+    report("frames", frames.done, room.num_states)
+    if not frames.complete:
+        renderer = Renderer(mi, build_scene(mi, plan, catalogue), plan.camera)
+        began = time.monotonic()
+        frames.render(renderer.frame, lambda: report("frames", frames.done, room.num_states))
+    seconds = (time.monotonic() - began) / frames.rendered if frames.rendered else None
+    features, described, features_log = encode_in_steps(
+        frames.read,
+        room.num_states,
+        network,
+        out.with_name(f".{out.name}.features"),
+        {"plan": to_yaml(plan), "renderer": str(backend)},
+        progress=lambda done, total: report("features", done, total),
+    )
+    arrays = {
+        "graph": room.graph,
+        "resnet_feature": features,
+        "location": room.location,
+        "rotation": room.rotation,
+        "shortest_path_distance": shortest_path_distances(room.graph).numpy(),
+    }
+    attributes = {**_attributes(plan, catalogue, backend, frames.exposure), **described}
+    pictures = frames.read(0, room.num_states)
+    write(out, arrays, name=plan.name, actions=default_actions(4), attributes=attributes, pictures=pictures)
+    frames.remove()
+    features_log.remove()
+    share = look_alike_share(features)
+    return Rendered(out, room.num_states, str(backend), seconds, share)
