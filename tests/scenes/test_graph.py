@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from vusfa.errors import GoalError
-from vusfa.scenes import Scene, bundled_names
+from vusfa.scenes import Scene, bundled_names, markov
 from vusfa.scenes import graph as graphs
 
 
@@ -99,7 +99,7 @@ def test_random_walk_is_that_of_the_transcription(table: np.ndarray, steps: int,
     num_states = len(table)
     starts = data.draw(st.none() | st.lists(st.integers(0, num_states - 1), min_size=1))
     uniform = np.full(table.shape, 1 / table.shape[1])
-    found = graphs.random_walk_success(table, range(num_states), steps, starts)
+    found = markov.random_walk_success(table, range(num_states), steps, starts)
     expected = [success_by_hand(table, uniform, goal, steps, starts) for goal in range(num_states)]
     np.testing.assert_allclose(found.numpy(), expected, rtol=0, atol=1e-12)
 
@@ -111,10 +111,10 @@ def test_policy_success_is_that_of_the_transcription(table: np.ndarray, steps: i
     num_states, num_actions = table.shape
     goals = rng.integers(0, num_states, size=4)
     policies = rng.dirichlet(np.full(num_actions, 0.3), size=(4, num_states))
-    one_each = graphs.policy_success(table, torch.from_numpy(policies), torch.from_numpy(goals), steps)
+    one_each = markov.policy_success(table, torch.from_numpy(policies), torch.from_numpy(goals), steps)
     expected = [success_by_hand(table, p, int(g), steps) for p, g in zip(policies, goals, strict=True)]
     np.testing.assert_allclose(one_each.numpy(), expected, rtol=0, atol=1e-12)
-    shared = graphs.policy_success(table, policies[0], goals, steps)
+    shared = markov.policy_success(table, policies[0], goals, steps)
     expected = [success_by_hand(table, policies[0], int(goal), steps) for goal in goals]
     np.testing.assert_allclose(shared.numpy(), expected, rtol=0, atol=1e-12)
 
@@ -124,30 +124,30 @@ def test_numbers_worked_out_by_hand() -> None:
     line = torch.tensor([[1, -1], [2, 0], [-1, 1]])
     assert graphs.shortest_path_distances(line).tolist() == [[0, 1, 2], [1, 0, 1], [2, 1, 0]]
     # To state 2 in 3 steps: from 1 by R, LRR (1/2 + 1/8); from 0 by RR*, BRR (1/4 + 1/8).
-    assert graphs.arrival_probability(line, torch.full((3, 2), 0.5), 2, 3).tolist() == [[3 / 8, 5 / 8, 1.0]]
-    assert graphs.random_walk_success(line, 2, 3).tolist() == [0.5]
-    assert graphs.random_walk_success(line, [2], 3, starts=[1]).tolist() == [5 / 8]
-    assert graphs.random_walk_success(line, [2], 3, starts=[2, 1, 1]).tolist() == [5 / 8]
-    assert graphs.random_walk_success(line, [0, 1], 0).tolist() == [0.0, 0.0]
+    assert markov.arrival_probability(line, torch.full((3, 2), 0.5), 2, 3).tolist() == [[3 / 8, 5 / 8, 1.0]]
+    assert markov.random_walk_success(line, 2, 3).tolist() == [0.5]
+    assert markov.random_walk_success(line, [2], 3, starts=[1]).tolist() == [5 / 8]
+    assert markov.random_walk_success(line, [2], 3, starts=[2, 1, 1]).tolist() == [5 / 8]
+    assert markov.random_walk_success(line, [0, 1], 0).tolist() == [0.0, 0.0]
 
 
 def test_unreachable_pairs_are_left_out_and_goals_that_none_reaches_are_nan() -> None:
     # 0 <-> 1, and 2 alone: state 2 can only ever be left.
     graph = torch.tensor([[1], [0], [0]])
     assert graphs.steps_to_goals(graph, [0, 2]).tolist() == [[0, 1, 1], [-1, -1, 0]]
-    found = graphs.random_walk_success(graph, [0, 2], 1)
+    found = markov.random_walk_success(graph, [0, 2], 1)
     assert found[0] == 1.0
     assert found[1].isnan()
-    assert graphs.random_walk_success(graph, 1, 2).tolist() == [1.0]
-    assert graphs.random_walk_success(graph, 1, 1).tolist() == [0.5]  # from 0 yes, from 2 not yet
-    assert graphs.random_walk_success(graph, [1], 1, starts=[1]).isnan().all()
+    assert markov.random_walk_success(graph, 1, 2).tolist() == [1.0]
+    assert markov.random_walk_success(graph, 1, 1).tolist() == [0.5]  # from 0 yes, from 2 not yet
+    assert markov.random_walk_success(graph, [1], 1, starts=[1]).isnan().all()
 
 
 def test_float32_softmax_is_taken_for_a_distribution() -> None:
     line = torch.tensor([[1, -1], [2, 0], [-1, 1]])
     torch.manual_seed(0)
     policy = torch.randn(3, 2).softmax(-1)
-    found = graphs.policy_success(line, policy, 2, 40)
+    found = markov.policy_success(line, policy, 2, 40)
     exact = policy.double() / policy.double().sum(-1, keepdim=True)
     assert abs(float(found) - success_by_hand(line.numpy(), exact.numpy(), 2, 40)) < 1e-12
 
@@ -157,11 +157,11 @@ def test_many_blocks_of_goals_join_up(monkeypatch: pytest.MonkeyPatch) -> None:
     table = rng.integers(-1, 20, (20, 3))
     policies = rng.dirichlet(np.ones(3), size=(20, 20))
     uniform = np.full((20, 3), 1 / 3)
-    whole = [graphs.arrival_probability(table, policy, range(20), 9) for policy in (policies, uniform)]
+    whole = [markov.arrival_probability(table, policy, range(20), 9) for policy in (policies, uniform)]
     distance = graphs.shortest_path_distances(table)
-    monkeypatch.setattr(graphs, "_WALK_ELEMENTS", {2: 60, 3: 60})
+    monkeypatch.setattr(markov, "_WALK_ELEMENTS", {2: 60, 3: 60})
     monkeypatch.setattr(graphs, "_SEARCH_ELEMENTS", 60)
-    parts = [graphs.arrival_probability(table, policy, range(20), 9) for policy in (policies, uniform)]
+    parts = [markov.arrival_probability(table, policy, range(20), 9) for policy in (policies, uniform)]
     assert torch.equal(parts[0], whole[0])
     assert torch.equal(parts[1], whole[1])
     assert torch.equal(graphs.shortest_path_distances(table), distance)
@@ -177,28 +177,28 @@ def test_paths_longer_than_int16_holds() -> None:
 @pytest.mark.parametrize(
     ("call", "error", "words"),
     [
-        (lambda g: graphs.random_walk_success(g, [3], 5), GoalError, "goal 3 is not a state.*0..2"),
-        (lambda g: graphs.random_walk_success(g, [-1], 5), GoalError, "goal -1 is not a state"),
-        (lambda g: graphs.random_walk_success(g, [0], 5, starts=[9]), GoalError, "start 9 is not a state"),
+        (lambda g: markov.random_walk_success(g, [3], 5), GoalError, "goal 3 is not a state.*0..2"),
+        (lambda g: markov.random_walk_success(g, [-1], 5), GoalError, "goal -1 is not a state"),
+        (lambda g: markov.random_walk_success(g, [0], 5, starts=[9]), GoalError, "start 9 is not a state"),
         (lambda g: graphs.steps_to_goals(g, [0.5]), GoalError, "integer state ids"),
-        (lambda g: graphs.random_walk_success(g, [0], -1), ValueError, "steps is -1"),
+        (lambda g: markov.random_walk_success(g, [0], -1), ValueError, "steps is -1"),
         (
-            lambda g: graphs.policy_success(g, torch.ones(3, 3), [0], 5),
+            lambda g: markov.policy_success(g, torch.ones(3, 3), [0], 5),
             ValueError,
             r"shape \(3, 3\); give \(3, 2\)",
         ),
         (
-            lambda g: graphs.policy_success(g, torch.ones(3, 2), [0], 5),
+            lambda g: markov.policy_success(g, torch.ones(3, 2), [0], 5),
             ValueError,
             r"at \(0,\) is \[1.0, 1.0\]",
         ),
         (
-            lambda g: graphs.policy_success(g, torch.full((3, 2), torch.nan), [0], 5),
+            lambda g: markov.policy_success(g, torch.full((3, 2), torch.nan), [0], 5),
             ValueError,
             "not a distribution",
         ),
         (
-            lambda g: graphs.policy_success(g, torch.tensor([[1.5, -0.5]] * 3), [0], 5),
+            lambda g: markov.policy_success(g, torch.tensor([[1.5, -0.5]] * 3), [0], 5),
             ValueError,
             "not a distribution",
         ),
@@ -229,7 +229,7 @@ def test_bundled_rooms_have_their_published_numbers() -> None:
         assert float(between.min()) == 1  # every pair is reachable
         assert round(float(between.mean()), 1) == mean
         assert int(between.max()) == longest
-        success.append(graphs.random_walk_success(room.graph, torch.arange(room.num_states), 500))
+        success.append(markov.random_walk_success(room.graph, torch.arange(room.num_states), 500))
         assert round(float(success[-1].mean()), 3) == walk
     assert round(float(torch.cat(success).mean()), 3) == 0.291
 
@@ -245,16 +245,21 @@ def test_random_walk_of_a_room_is_that_of_dense_matrix_powers() -> None:
     transition[goal, goal] = 1
     reached = np.linalg.matrix_power(transition, 500)[:, goal]
     expected = np.delete(reached, goal).mean()
-    assert abs(float(graphs.random_walk_success(room.graph, goal, 500)) - expected) < 1e-12
+    assert abs(float(markov.random_walk_success(room.graph, goal, 500)) - expected) < 1e-12
 
 
 def test_all_goals_of_the_kitchen_take_seconds() -> None:
     room = Scene.bundled("kitchen")
     goals = torch.arange(room.num_states)
     began = time.process_time()
-    walk = graphs.random_walk_success(room.graph, goals, 500)
+    walk = markov.random_walk_success(room.graph, goals, 500)
     policy = torch.full((room.num_states, room.num_states, 4), 0.25)
-    each = graphs.policy_success(room.graph, policy, goals, 500)
+    each = markov.policy_success(room.graph, policy, goals, 500)
     seconds = time.process_time() - began
     torch.testing.assert_close(walk, each, rtol=0, atol=1e-12)
     assert seconds < 20  # 2 seconds on an idle core
+
+
+def test_old_names_are_found_and_warn() -> None:
+    with pytest.warns(DeprecationWarning, match=r"vusfa\.scenes\.markov\.policy_success"):
+        assert graphs.policy_success is markov.policy_success

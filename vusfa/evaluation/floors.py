@@ -14,7 +14,7 @@ from torch import Tensor
 from vusfa.evaluation.episodes import Episodes
 from vusfa.evaluation.navigation import Unreachable
 from vusfa.scenes import Scene
-from vusfa.scenes.graph import random_walk_success
+from vusfa.scenes.markov import random_walk_success
 
 __all__ = ["random_walk", "shortest_paths"]
 

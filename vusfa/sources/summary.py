@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from vusfa.scenes.graph import random_walk_success
+from vusfa.scenes.markov import random_walk_success
 from vusfa.scenes.poses import places
 from vusfa.scenes.scene import Scene
 
