@@ -13,14 +13,16 @@ from collections.abc import Sequence
 
 __all__ = ["COMMANDS", "main"]
 
-#: Modules of this package that add commands, in the order in which ``--help`` shows them.
+#: Modules that add commands, in the order in which ``--help`` shows them. A new command is a module with a
+#: function ``register(scenes)``, and a line here.
 COMMANDS = [
-    "inspect",
-    "photos",
-    "thor",
-    "encode",
-    "fetch",
-    "render",
+    "vusfa.cli.inspect",
+    "vusfa.cli.photos",
+    "vusfa.cli.thor",
+    "vusfa.cli.encode",
+    "vusfa.cli.fetch",
+    "vusfa.cli.render",
+    "vusfa.cli.compact",
 ]
 
 

@@ -60,4 +60,4 @@ def _vusfa(
 
 
 for _name in COMMANDS:
-    import_module(f"vusfa.cli.{_name}").register(scenes)
+    import_module(_name).register(scenes)

@@ -133,6 +133,25 @@ class Scene:
         """
         return cls.load(store.bundled_path(name))
 
+    @classmethod
+    def open(cls, source: str | os.PathLike[str]) -> Scene:
+        """A bundled room by name, or a scene file by path.
+
+        A string without suffix and folder is a bundled name, anything else a file.
+
+        Raises:
+            SceneError: neither a bundled name nor a file, or a file with faults.
+        """
+        if isinstance(source, str) and not Path(source).suffix and os.sep not in source:
+            if source in store.bundled_names():
+                return cls.bundled(source)
+            if not Path(source).is_file():
+                raise SceneError(
+                    f"{source!r} is neither a bundled scene ({', '.join(store.bundled_names())}) nor a file;"
+                    f" check the name"
+                )
+        return cls.load(source)
+
     def save(
         self, path: str | os.PathLike[str], pictures: Tensor | np.ndarray | Sequence[bytes] | None = None
     ) -> None:

@@ -1,7 +1,7 @@
 """Several scenes as one space of state ids.
 
-A set numbers the states of its scenes through: scene i has the ids ``offsets[i] .. offsets[i + 1] - 1``.
-Whoever works with a set (environments, networks) holds integers and looks the rest up here.
+A set numbers the states of its scenes consecutively: scene i has ``offsets[i] .. offsets[i + 1] - 1``.
+Environments and networks hold these integers and look everything else up here.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ from vusfa.errors import SceneError
 from vusfa.scenes.graph import successor_table
 from vusfa.scenes.scene import Scene
 from vusfa.scenes.store import bundled_names
+from vusfa.scenes.validation import check_alike
 
 __all__ = ["SceneSet"]
 
@@ -52,12 +53,16 @@ class SceneSet:
 
     def __init__(self, scenes: Iterable[Scene]) -> None:
         self.scenes: tuple[Scene, ...] = tuple(scenes)
-        _check_alike(self.scenes)
+        for scene in self.scenes:
+            if not isinstance(scene, Scene):
+                raise SceneError(f"{scene!r} is no Scene; open names and files with SceneSet.open")
+        if not self.scenes:
+            raise SceneError(f"a SceneSet needs at least one scene; bundled are {', '.join(bundled_names())}")
+        check_alike(self.scenes)
         self._build()
 
     def _build(self) -> None:
-        # In NumPy on purpose: torch joins large tensors on several threads, and those hang in a forked
-        # process whose parent has used them. Rooms must open there too.
+        # NumPy on purpose: torch's threads hang in a forked process whose parent has used them.
         sizes = [scene.num_states for scene in self.scenes]
         offsets = np.cumsum([0, *sizes])
         tables = [successor_table(scene.graph) for scene in self.scenes]
@@ -86,9 +91,8 @@ class SceneSet:
     def open(cls, scenes: str | os.PathLike[str] | Sequence[str | os.PathLike[str]]) -> SceneSet:
         """Bundled names and files alike: ``SceneSet.open(["bathroom", "my_room.h5"])``.
 
-        A bare word is a bundled name; whatever has a suffix or a folder in it is a file. Scenes that call
-        themselves alike, as rooms of one kind rendered from several seeds do, are called by their files'
-        names without suffix.
+        Each is opened by :meth:`Scene.open`. Scenes of the same name, such as rooms of one kind rendered from
+        several seeds, are renamed after their files, without suffix.
 
         Raises:
             SceneError: neither a bundled name nor a file, or a file with faults.
@@ -96,10 +100,10 @@ class SceneSet:
         >>> SceneSet.open("kitchen").num_states
         680
         """
-        given = _listed(scenes)
-        opened = [_open_one(scene) for scene in given]
+        sources = _listed(scenes)
+        opened = [Scene.open(source) for source in sources]
         names = [scene.name for scene in opened]
-        for source, scene in zip(given, opened, strict=True):
+        for source, scene in zip(sources, opened, strict=True):
             if names.count(scene.name) > 1 and Path(source).suffix:
                 object.__setattr__(scene, "name", Path(source).stem)  # nobody else holds it yet
         return cls(opened)
@@ -205,9 +209,9 @@ class SceneSet:
         num_states = self.scenes[index].num_states
         wrong = ids[(ids < 0) | (ids >= num_states)]
         if wrong.numel():
+            name = self.names[index]
             raise SceneError(
-                f"scene {self.names[index]!r} has no state {int(wrong[0])};"
-                f" its states are 0..{num_states - 1}"
+                f"scene {name!r} has no state {int(wrong[0])}; its states are 0..{num_states - 1}"
             )
         return ids + self.offsets[index]
 
@@ -239,27 +243,24 @@ class SceneSet:
             raise SceneError(f"there is no state {wrong[0]}; this set has 0..{self.num_states - 1}")
         offsets = self.offsets.cpu().numpy()
         scene_id = np.searchsorted(offsets, flat, side="right") - 1
-        involved = np.unique(scene_id).tolist() or [0]
-        first = self.scenes[involved[0]]
+        indices = np.unique(scene_id).tolist() or [0]
+        first = self.scenes[indices[0]]
         result = np.empty((len(flat), *(first.picture_shape or ())), dtype=np.uint8)
-        for index in involved:
-            scene = self.scenes[index]
-            rows = scene_id == index
-            found = scene.pictures(flat[rows] - offsets[index]).numpy()
-            if scene.picture_shape != first.picture_shape:
+        for index in indices:
+            scene, rows = self.scenes[index], scene_id == index
+            if scene.picture_shape != first.picture_shape and scene.has_pictures and first.has_pictures:
                 raise SceneError(
                     f"scenes {first.name!r} and {scene.name!r} have pictures of different sizes"
                     f" ({first.picture_shape}, {scene.picture_shape}); ask scene by scene"
                 )
-            result[rows] = found
+            result[rows] = scene.pictures(flat[rows] - offsets[index]).numpy()
         return torch.from_numpy(result).reshape(*ids.shape, *result.shape[1:])
 
     def to(self, device: torch.device | str) -> SceneSet:
         """The same set with its tables on a device; the scenes themselves stay on the CPU."""
         moved = object.__new__(SceneSet)
-        moved.__dict__.update(
-            {k: v.to(device) if isinstance(v, Tensor) else v for k, v in self.__dict__.items()}
-        )
+        for name, value in vars(self).items():
+            setattr(moved, name, value.to(device) if isinstance(value, Tensor) else value)
         return moved
 
     @property
@@ -298,41 +299,3 @@ def _joined(arrays: list[np.ndarray]) -> Tensor:
 
 def _listed(scenes: Any) -> list[Any]:
     return [scenes] if isinstance(scenes, str | os.PathLike) else list(scenes)
-
-
-def _open_one(scene: str | os.PathLike[str]) -> Scene:
-    if isinstance(scene, str) and not Path(scene).suffix and os.sep not in scene:
-        if scene in bundled_names():
-            return Scene.bundled(scene)
-        if not Path(scene).is_file():
-            raise SceneError(
-                f"{scene!r} is neither a bundled scene ({', '.join(bundled_names())}) nor a file;"
-                f" check the name"
-            )
-    return Scene.load(scene)
-
-
-def _check_alike(scenes: Sequence[Scene]) -> None:
-    for scene in scenes:
-        if not isinstance(scene, Scene):
-            raise SceneError(f"{scene!r} is no Scene; open names and files with SceneSet.open")
-    if not scenes:
-        raise SceneError(f"a SceneSet needs at least one scene; bundled are {', '.join(bundled_names())}")
-    names = [scene.name for scene in scenes]
-    for name in names:
-        if names.count(name) > 1:
-            raise SceneError(
-                f"{names.count(name)} scenes are called {name!r}; rename all but one (attribute 'scene')"
-            )
-    first = scenes[0]
-    for scene in scenes[1:]:
-        for what, of_first, of_this in (
-            ("actions", first.actions, scene.actions),
-            ("crops", first.num_crops, scene.num_crops),
-            ("feature size", first.feature_size, scene.feature_size),
-        ):
-            if of_first != of_this:
-                raise SceneError(
-                    f"scenes {first.name!r} and {scene.name!r} differ in {what} ({of_first}, {of_this});"
-                    f" put them in different sets"
-                )

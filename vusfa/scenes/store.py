@@ -23,13 +23,13 @@ from typing import Any
 import h5py
 import numpy as np
 
+from vusfa.deprecated import moved_names
 from vusfa.errors import SceneError
 from vusfa.scenes import pictures as picture_files
-from vusfa.scenes.graph import default_actions
 from vusfa.scenes.hdf5 import dataset_in, opened, plain, replaced
-from vusfa.scenes.validation import DATASETS, array_faults, raise_faults
+from vusfa.scenes.validation import DATASETS, array_faults
 
-__all__ = ["Dump", "bundled_names", "bundled_path", "compact", "read", "validate", "write"]
+__all__ = ["Dump", "bundled_names", "bundled_path", "read", "validate", "write"]
 
 _BUNDLED = Path(__file__).parent / "bundled"
 
@@ -222,38 +222,4 @@ def write(
             picture_files.write_jpegs(file, jpegs)
 
 
-def compact(source: str | os.PathLike[str], target: str | os.PathLike[str]) -> None:
-    """A small copy of a scene file: features as float16, raw pictures as JPEG files of quality 92.
-
-    Pictures that are JPEG files already are kept byte for byte. Rounding to float16 changes a feature by at
-    most one part in 2048 (one below 6.1e-5 by at most 3e-8).
-
-    Raises:
-        SceneError: the source has faults, or a feature is beyond float16's range; or see :func:`write`.
-    """
-    source = Path(source)
-    dump = read(source)
-    raise_faults(source, dump.faults())
-    with np.errstate(over="ignore"):
-        half = dump.arrays["resnet_feature"].astype(np.float16)
-    if not np.isfinite(half).all():
-        state = int(np.argwhere(~np.isfinite(half))[0][0])
-        raise SceneError(
-            f"{source}: dataset 'resnet_feature', state {state}: a value is beyond float16's range of"
-            f" +-65504; scale the features down"
-        )
-    num_states, num_actions = dump.arrays["graph"].shape
-    pictures: Path | list[bytes] | None = None
-    if dump.picture_shape is not None:
-        pictures = source
-        if picture_files.read_jpegs(source) is None:
-            blocks = picture_files.raw_blocks(source, num_states)
-            pictures = [picture_files.to_jpeg(picture) for block in blocks for picture in block]
-    write(
-        target,
-        {**dump.arrays, "resnet_feature": half.astype(np.float32)},
-        name=dump.name,
-        actions=dump.actions or default_actions(num_actions),
-        attributes=dump.attributes,
-        pictures=pictures,
-    )
+__getattr__ = moved_names(__name__, {"compact": "vusfa.sources.compact.compact"})

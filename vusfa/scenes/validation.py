@@ -9,15 +9,20 @@ from __future__ import annotations
 
 import os
 from collections.abc import Collection, Mapping, Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from vusfa.errors import SceneError
 from vusfa.scenes.graph import shortest_path_distances
 
+if TYPE_CHECKING:
+    from vusfa.scenes.scene import Scene
+
 __all__ = [
     "DATASETS",
     "array_faults",
+    "check_alike",
     "distance_faults",
     "feature_faults",
     "graph_faults",
@@ -197,3 +202,29 @@ def array_faults(
         if name in sound:
             faults += pose_faults(name, sound[name])
     return faults
+
+
+def check_alike(scenes: Sequence[Scene]) -> None:
+    """Check that scenes can form one set.
+
+    Raises:
+        SceneError: two of one name, or scenes that differ in actions, crops or feature size.
+    """
+    names = [scene.name for scene in scenes]
+    for name in names:
+        if names.count(name) > 1:
+            raise SceneError(
+                f"{names.count(name)} scenes are called {name!r}; rename all but one (attribute 'scene')"
+            )
+    first = scenes[0]
+    for scene in scenes[1:]:
+        for what, of_first, of_this in (
+            ("actions", first.actions, scene.actions),
+            ("crops", first.num_crops, scene.num_crops),
+            ("feature size", first.feature_size, scene.feature_size),
+        ):
+            if of_first != of_this:
+                raise SceneError(
+                    f"scenes {first.name!r} and {scene.name!r} differ in {what} ({of_first}, {of_this});"
+                    f" put them in different sets"
+                )

@@ -1,10 +1,7 @@
-"""The small copy of a scene file, and the command that makes it."""
+"""The small copy of a scene file."""
 
 from __future__ import annotations
 
-import os
-import subprocess
-import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -14,9 +11,8 @@ import pytest
 import torch
 
 from vusfa.errors import SceneError
-from vusfa.scenes import Scene
-from vusfa.scenes.__main__ import main
-from vusfa.scenes.store import compact
+from vusfa.scenes import Scene, store
+from vusfa.sources.compact import compact
 
 # What the bundled rooms were made from, where it lies beside the repository.
 _RENDERED = Path(__file__).parents[3] / "shared" / "scenes"
@@ -64,21 +60,9 @@ def test_features_beyond_half_precision_are_refused(make_file: Callable[..., Pat
     assert not (tmp_path / "small.h5").exists()
 
 
-def test_the_command(make_file: Callable[..., Path], tmp_path: Path) -> None:
-    target = tmp_path / "small.h5"
-    line = [sys.executable, "-m", "vusfa.scenes", "compact", str(make_file()), str(target)]
-    done = subprocess.run(line, capture_output=True, text=True, env={**os.environ, "PYTHONWARNINGS": "error"})
-    assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
-    assert Scene.load(target).num_states == 5
-
-
-def test_the_command_refuses_a_faulty_file(
-    make_file: Callable[..., Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    source, target = make_file(rotation=None), tmp_path / "small.h5"
-    assert main(["compact", str(source), str(target)]) == 1
-    assert capsys.readouterr().err == f"{source}: dataset 'rotation' is missing; write it as numbers (N,)\n"
-    assert not target.exists()
+def test_the_old_name_is_found_and_warns() -> None:
+    with pytest.warns(DeprecationWarning, match=r"vusfa\.sources\.compact\.compact"):
+        assert store.compact is compact
 
 
 @pytest.mark.skipif(not _RENDERED.is_dir(), reason="the rendered rooms do not lie beside the repository")

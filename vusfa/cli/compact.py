@@ -1,0 +1,32 @@
+"""``vusfa scenes compact``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+__all__ = ["register"]
+
+
+def register(scenes: typer.Typer) -> None:
+    """Add the command to ``vusfa scenes``."""
+    scenes.command("compact")(compact)
+
+
+def compact(
+    source: Annotated[Path, typer.Argument(help="Scene file to read.", show_default=False)],
+    target: Annotated[Path, typer.Argument(help="Scene file to write.", show_default=False)],
+) -> None:
+    """Make a small copy of a scene: float16 features, JPEG pictures, compressed tables.
+
+    The bundled rooms were made with it. JPEG pictures are kept byte for byte.
+
+    Examples:
+
+        vusfa scenes compact room.h5 room_small.h5
+    """
+    from vusfa.sources.compact import compact as write_compact
+
+    write_compact(source, target)
