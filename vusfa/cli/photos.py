@@ -2,18 +2,13 @@
 
 from __future__ import annotations
 
-import hashlib
-import io
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 
 from vusfa.errors import SceneError
-
-if TYPE_CHECKING:
-    import numpy as np
 
 __all__ = ["register"]
 
@@ -80,11 +75,11 @@ def from_photos(
 
         vusfa scenes from-photos lab/ --edges moves.csv --features lab.npy
     """
-    import torch
-
     from vusfa.cli.progress import progress
-    from vusfa.scenes import Scene
+    from vusfa.cli.resumed import resumed
     from vusfa.scenes.provenance import Provenance, this_tool, today
+    from vusfa.sources import backbones
+    from vusfa.sources.capture import capture
     from vusfa.sources.photos import lay_out, read_features, read_photos
 
     target = output or Path(f"{folder.resolve().name}.h5")
@@ -92,8 +87,15 @@ def from_photos(
         raise SceneError(f"{target}: exists; choose another name with -o, or replace it with --force")
     width, height = _size(size)
     layout = lay_out(folder, poses, edges, step=step, turn=turn)
-    given = None if features is None else read_features(features, len(layout.files))
-    network = None if given is not None else _network(backbone, weights)
+    # One text: HDF5 has room for some thousand only where they are a list.
+    attributes = {"photographs": "\n".join(layout.files)}
+    encoding: dict[str, Any]
+    if features is not None:
+        encoding = {"features": read_features(features, len(layout.files))}
+        attributes["feature"] = f"given, {features.name}"
+    else:
+        # loaded before the pictures are read, so that a missing one is reported at once
+        encoding = {"backbone": backbones.load_backbone(backbone, weights=weights)}
     with progress("reading pictures", len(layout.files), "pictures") as advance:
         pictures = read_photos(folder, layout.files, width, height, raw=store == Store.RAW, advance=advance)
     origin = Provenance(
@@ -103,26 +105,17 @@ def from_photos(
         licences=tuple(licence or ()),
         credits=tuple(credit or ()),
     )
-    # One text: HDF5 has room for some thousand only where they are a list.
-    attributes: dict[str, Any] = {**origin.attributes(), "photographs": "\n".join(layout.files)}
-    log = None
-    if given is None:
-        given, told, log = _encode(pictures, network, target)
-        attributes |= told
-    else:
-        attributes["feature"] = f"given, {features.name if features else ''}"
-    scene = Scene(
-        name or target.stem,
-        torch.from_numpy(layout.graph),
-        torch.from_numpy(given),
-        torch.from_numpy(layout.location),
-        torch.from_numpy(layout.rotation),
-        actions=layout.actions,
-        attributes=attributes,
-    )
-    scene.save(target, pictures)
-    if log is not None:
-        log.remove()
+    with resumed("encoding", "pictures") as report:
+        scene = capture(
+            target,
+            name or target.stem,
+            layout,
+            pictures,
+            origin,
+            attributes=attributes,
+            progress=report,
+            **encoding,
+        )
     typer.echo(f"{target}: {scene.num_states} states, {layout.found}")
     _warn(layout.left_out, scene)
 
@@ -136,39 +129,6 @@ def _size(size: str) -> tuple[int, int]:
     if not (width.isdecimal() and height.isdecimal() and 0 < int(width) <= 4096 and 0 < int(height) <= 4096):
         raise SceneError(f"--size is {size!r}; write WIDTHxHEIGHT in pixels, 200x150")
     return int(width), int(height)
-
-
-def _network(backbone: str, weights: Path | None) -> Any:
-    """The network; asked for before the pictures are read, so that a missing one is said at once."""
-    from vusfa.sources.backbones import load_backbone
-
-    return load_backbone(backbone, weights=weights)
-
-
-def _encode(
-    pictures: np.ndarray | list[bytes], network: Any, target: Path
-) -> tuple[np.ndarray, dict[str, str], Any]:
-    """Features of the pictures as the scene will have them, what to say of them, and the log to remove."""
-    import numpy as np
-    from PIL import Image
-
-    from vusfa.cli.resumed import resumed
-    from vusfa.sources.encode import encode_in_steps
-
-    def read(first: int, last: int) -> np.ndarray:
-        some = [
-            picture if isinstance(picture, np.ndarray) else np.asarray(Image.open(io.BytesIO(picture)))
-            for picture in pictures[first:last]
-        ]
-        return np.stack(some)
-
-    digest = hashlib.sha256()
-    for picture in pictures:
-        digest.update(picture)
-    log = target.with_name(f".{target.name}.encode")
-    with resumed("encoding", "pictures") as report:
-        work = {"pictures": digest.hexdigest()}
-        return encode_in_steps(read, len(pictures), network, log, work, progress=report)
 
 
 def _warn(left_out: tuple[str, ...], scene: Any) -> None:

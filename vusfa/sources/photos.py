@@ -19,6 +19,7 @@ from vusfa.errors import SceneError
 from vusfa.scenes.graph import default_actions
 from vusfa.scenes.pictures import to_jpeg
 from vusfa.scenes.validation import raise_faults
+from vusfa.sources.capture import PoseGraph
 from vusfa.sources.grid import put_on_grid
 from vusfa.sources.photo_tables import edge_states, read_edges, read_poses
 
@@ -28,24 +29,16 @@ _ENDINGS = (".jpg", ".jpeg", ".png")
 
 
 @dataclass(frozen=True)
-class Layout:
+class Layout(PoseGraph):
     """What the states are, and where the actions lead.
 
     Attributes:
         files: N pictures, relative to their folder, in the order of the states.
-        graph: (N, A) int64, -1 = blocked.
-        actions: A names.
-        location: (N, 2) float64 metres; zeros when nothing says where the pictures were taken.
-        rotation: (N,) float64 degrees.
         found: what was inferred, for people to see, "a grid of 0.5 m, headings 90 degrees apart".
         left_out: pictures of the folder that are no state.
     """
 
     files: tuple[str, ...]
-    graph: np.ndarray
-    actions: tuple[str, ...]
-    location: np.ndarray
-    rotation: np.ndarray
     found: str
     left_out: tuple[str, ...]
 
@@ -99,11 +92,11 @@ def _by_poses(folder: Path, poses: Path, step: float | None, turn: int | None) -
     _require_pictures(folder, poses, table.files, table.labels)
     grid = put_on_grid(table.location, table.rotation, table.labels, step=step, turn=turn, source=poses)
     return Layout(
-        table.files,
         grid.graph,
-        default_actions(4),
         grid.location,
         grid.rotation,
+        default_actions(4),
+        table.files,
         f"a grid of {grid.step:.3g} m, headings {grid.turn} degrees apart",
         _left_out(folder, table.files),
     )
@@ -119,7 +112,7 @@ def _by_edges(folder: Path, edges: Path, poses: Path | None) -> Layout:
     _require_pictures(folder, poses or edges, files, labels)
     graph, actions = read_edges(edges, files)
     found = f"moves as in {edges.name}"
-    return Layout(files, graph, actions, location, rotation, found, _left_out(folder, files))
+    return Layout(graph, location, rotation, actions, tuple(files), found, _left_out(folder, files))
 
 
 def _require_pictures(folder: Path, table: Path, files: Sequence[str], labels: Sequence[str]) -> None:

@@ -22,13 +22,11 @@ from typing import Any, Protocol
 import numpy as np
 
 from vusfa.errors import SceneError
-from vusfa.scenes import store
-from vusfa.scenes.graph import shortest_path_distances
 from vusfa.scenes.provenance import Provenance, this_tool, today
 from vusfa.scenes.scene import Scene
 from vusfa.sources.backbones import DEFAULT, Backbone, load_backbone
-from vusfa.sources.encode import encode_in_steps
-from vusfa.sources.row_log import RowLog, file_sha256
+from vusfa.sources.capture import PoseGraph, capture
+from vusfa.sources.row_log import RowLog
 
 __all__ = ["ACTIONS", "HEADINGS", "Controller", "export", "successors"]
 
@@ -110,51 +108,31 @@ def export(
     location = np.array([[poses[r][0]["x"], poses[r][0]["z"]] for r in rows], dtype=np.float64)
     rotation = np.array([poses[r][1] for r in rows])
     graph, astray = successors(location, rotation, _column(log, "landing")[rows], step)
-
-    def frames(first: int, last: int) -> np.ndarray:
-        return np.concatenate([log.read(r, r + 1)["frame"] for r in rows[first:last]])
-
-    features, origin_of_features, feature_log = encode_in_steps(
-        frames,
-        len(rows),
-        network,
-        target.with_name(f".{target.name}.encode"),
-        {"frames": file_sha256(log.path)},
-        batch=batch,
-        progress=encoded,
-    )
-    origin = Provenance(
-        made_with=this_tool("scenes export-thor", **(versions or {})),
-        made_on=today(),
-        licences=("AI2-THOR: Apache License 2.0",),
-        credits=("AI2-THOR, Kolve et al., arXiv 1712.05474",),
-    )
-    store.write(
+    scene = capture(
         target,
-        {
-            "graph": graph,
-            "resnet_feature": features,
-            "location": location,
-            "rotation": rotation,
-            "shortest_path_distance": shortest_path_distances(graph).numpy(),
-        },
-        name=name,
-        actions=tuple(ACTIONS),
+        name,
+        PoseGraph(graph, location, rotation, tuple(ACTIONS)),
+        lambda first, last: np.concatenate([log.read(r, r + 1)["frame"] for r in rows[first:last]]),
+        Provenance(
+            made_with=this_tool("scenes export-thor", **(versions or {})),
+            made_on=today(),
+            licences=("AI2-THOR: Apache License 2.0",),
+            credits=("AI2-THOR, Kolve et al., arXiv 1712.05474",),
+        ),
         attributes={
             **(attributes or {}),
-            **origin.attributes(),
-            **origin_of_features,
             "cell_m": step,
             "horizon_deg": horizon,
             "frame": "location=(X right, Z forward); heading 0 = +Z, 90 = +X; RotateRight adds 90",
             "places_left_out": int((~at_all_headings).sum()),
             "moves_astray": astray,
         },
-        pictures=frames(0, len(rows)),
+        backbone=network,
+        batch=batch,
+        progress=encoded,
     )
     log.remove()
-    feature_log.remove()
-    return Scene.load(target)
+    return scene
 
 
 def _step(controller: Controller, action: str, **arguments: Any) -> Any:

@@ -15,12 +15,11 @@ from pathlib import Path
 from typing import Any
 
 from vusfa.errors import SceneError
-from vusfa.scenes.graph import default_actions, shortest_path_distances
+from vusfa.scenes.graph import default_actions
 from vusfa.scenes.provenance import Provenance, this_tool, today
-from vusfa.scenes.store import write
 from vusfa.scenes.validation import raise_faults
 from vusfa.sources.backbones import DEFAULT, Backbone, load_backbone
-from vusfa.sources.encode import encode_in_steps
+from vusfa.sources.capture import PoseGraph, capture
 from vusfa.sources.render import backend as backends
 from vusfa.sources.render.catalogue import LICENCES, Catalogue
 from vusfa.sources.render.faults import plan_faults
@@ -72,12 +71,10 @@ def credits(plan: Plan, catalogue: Catalogue) -> tuple[tuple[str, ...], tuple[st
     return licences, tuple(model.credit for model in models)
 
 
-def _attributes(
-    plan: Plan, catalogue: Catalogue, backend: backends.Backend, exposure: float
-) -> dict[str, Any]:
+def _origin(plan: Plan, catalogue: Catalogue) -> Provenance:
     versions = {name: metadata.version(name) for name in ("mitsuba", "mitsuba-oidn", "trimesh")}
     licences, thanks = credits(plan, catalogue)
-    origin = Provenance(
+    return Provenance(
         made_with=this_tool("scenes render", **versions),
         made_on=today(),
         plan=to_yaml(plan),
@@ -85,8 +82,12 @@ def _attributes(
         licences=licences,
         credits=thanks,
     )
+
+
+def _attributes(
+    plan: Plan, catalogue: Catalogue, backend: backends.Backend, exposure: float
+) -> dict[str, Any]:
     return {
-        **origin.attributes(),
         "kind": plan.kind or "room",
         "models": [f"{name} {catalogue[name].title}" for name in plan.models],
         "renderer": backend.variant,
@@ -152,25 +153,16 @@ def render_room(
         began = time.monotonic()
         frames.render(renderer.frame, lambda: report("frames", frames.done, room.num_states))
     seconds = (time.monotonic() - began) / frames.rendered if frames.rendered else None
-    features, described, features_log = encode_in_steps(
+    scene = capture(
+        out,
+        plan.name,
+        PoseGraph(room.graph, room.location, room.rotation, default_actions(4)),
         frames.read,
-        room.num_states,
-        network,
-        out.with_name(f".{out.name}.features"),
-        {"plan": to_yaml(plan), "renderer": str(backend)},
+        _origin(plan, catalogue),
+        attributes=_attributes(plan, catalogue, backend, frames.exposure),
+        backbone=network,
         progress=lambda done, total: report("features", done, total),
     )
-    arrays = {
-        "graph": room.graph,
-        "resnet_feature": features,
-        "location": room.location,
-        "rotation": room.rotation,
-        "shortest_path_distance": shortest_path_distances(room.graph).numpy(),
-    }
-    attributes = {**_attributes(plan, catalogue, backend, frames.exposure), **described}
-    pictures = frames.read(0, room.num_states)
-    write(out, arrays, name=plan.name, actions=default_actions(4), attributes=attributes, pictures=pictures)
     frames.remove()
-    features_log.remove()
-    share = look_alike_share(features)
+    share = look_alike_share(scene.features.numpy())
     return Rendered(out, room.num_states, str(backend), seconds, share)
