@@ -11,7 +11,7 @@ from benchmarks.peers.bare_update import BareTraining
 from benchmarks.peers.feature_fed import feature_fed
 from benchmarks.report import Options, Report, Requirement, Row
 from benchmarks.timing import Timing, Work, interleaved, ratio
-from benchmarks.trainer import make_trainer, small
+from benchmarks.trainer import running, small
 
 __all__ = ["run"]
 
@@ -30,11 +30,9 @@ def run(options: Options) -> Report:
 def _at(size: int, options: Options, report: Report) -> None:
     overrides = ["agent.model=vusfa", "agent.history=4", *small(options), f"collector.num_envs={size}"]
     with ExitStack() as stack:
-        ours = make_trainer(overrides)
-        stack.callback(ours.close)
-        fed = feature_fed(overrides)
-        stack.callback(fed.close)
-        bare = BareTraining(ours)
+        ours = stack.enter_context(running(overrides))
+        fed = stack.enter_context(feature_fed(overrides))
+        bare = BareTraining(ours.trainer)
         counts = sorted({1, options.threads})
         works = {
             f"{name}, {threads} threads": Work(call, threads)

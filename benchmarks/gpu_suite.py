@@ -10,7 +10,7 @@ import torch
 from benchmarks.report import Options, Report, Requirement, Row
 from benchmarks.solve_suite import checker, solve_row, train_until
 from benchmarks.timing import Work, interleaved
-from benchmarks.trainer import Trainer, make_trainer, small
+from benchmarks.trainer import Running, running, small
 
 __all__ = ["run"]
 
@@ -29,20 +29,19 @@ def run(options: Options) -> Report:
     for history in (1, 4):
         for envs in (8,) if options.quick else ENVS:
             with ExitStack() as stack:
-                trainer = make_trainer([*base, f"agent.history={history}", f"collector.num_envs={envs}"])
-                stack.callback(trainer.close)
-                work = {"ours": Work(_synchronised(trainer))}
+                sizes = [f"agent.history={history}", f"collector.num_envs={envs}"]
+                ours = stack.enter_context(running([*base, *sizes]))
+                work = {"ours": Work(_synchronised(ours))}
                 timing = interleaved(work, options.repetitions, options.seconds)["ours"]
             name = f"updates on the GPU, history {history}, {envs} environments"
             report.rows.append(Row(name, timing.per_second, "frames/s", samples=tuple(timing.rates)))
             best = max(best, timing.per_second)
-    trainer = make_trainer(base)
-    session = trainer.session
-    scenes = session.scenes.to("cuda")
-    check = checker(trainer.actor, scenes, session.goals, session.agent.config["history"], options)
-    cap, every = (0.5, 0.5) if options.quick else (options.cap, 5.0)
-    outcome = train_until(_synchronised(trainer), check, cap, every, trainer.cfg.total_frames)
-    trainer.close()
+    with running(base) as ours:
+        trainer = ours.trainer
+        scenes = trainer.scenes.to("cuda")
+        check = checker(trainer.actor, scenes, trainer.goals, trainer.agent.config["history"], options)
+        cap, every = (0.5, 0.5) if options.quick else (options.cap, 5.0)
+        outcome = train_until(_synchronised(ours), check, cap, every, trainer.settings["total_frames"])
     report.rows.append(solve_row("vusfa on the GPU", outcome))
     report.requirements.append(Requirement("training on one GPU", best, FRAMES, "frames/s"))
     what = "time to solve on one GPU"
@@ -50,9 +49,9 @@ def run(options: Options) -> Report:
     return report
 
 
-def _synchronised(trainer: Trainer) -> Callable[[], int]:
+def _synchronised(ours: Running) -> Callable[[], int]:
     def update() -> int:
-        frames = trainer.update()
+        frames = ours.update()
         torch.cuda.synchronize()
         return frames
 

@@ -14,7 +14,7 @@ import psutil
 import torch
 
 from benchmarks.report import Options, Report, Requirement, Row
-from benchmarks.trainer import make_trainer, small
+from benchmarks.trainer import running, small
 
 __all__ = ["bytes_a_frame", "growth", "peak", "peak_so_far", "run"]
 
@@ -50,18 +50,16 @@ def run(options: Options) -> Report:
 
 def bytes_a_frame(overrides: Sequence[str]) -> float:
     """Bytes of a collected batch, a frame."""
-    trainer = make_trainer(overrides)
-    batch = next(trainer.batches)
-    trainer.close()
+    with running(overrides) as ours:
+        batch = next(ours.batches)
     return batch.bytes() / batch.numel()
 
 
 def peak(overrides: Sequence[str], updates: int) -> float:
     """The most memory that this process has held after so many updates, MiB."""
-    trainer = make_trainer(overrides)
-    for _ in range(updates):
-        trainer.update()
-    trainer.close()
+    with running(overrides) as ours:
+        for _ in range(updates):
+            ours.update()
     return peak_so_far()
 
 
@@ -77,16 +75,15 @@ def peak_so_far() -> float:
 def growth(overrides: Sequence[str], updates: int) -> float:
     """Resident memory after so many updates less that after a tenth of them, MiB."""
     torch.set_num_threads(1)
-    trainer = make_trainer(overrides)
     own, before = psutil.Process(), 0
-    for index in range(updates + updates // 10):
-        if index == updates // 10:
-            gc.collect()
-            before = own.memory_info().rss
-        trainer.update()
-    gc.collect()
-    after = own.memory_info().rss
-    trainer.close()
+    with running(overrides) as ours:
+        for index in range(updates + updates // 10):
+            if index == updates // 10:
+                gc.collect()
+                before = own.memory_info().rss
+            ours.update()
+        gc.collect()
+        after = own.memory_info().rss
     return (after - before) / 2**20
 
 

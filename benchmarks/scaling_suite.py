@@ -11,7 +11,7 @@ import torch
 
 from benchmarks.memory_suite import peak_so_far
 from benchmarks.report import Options, Report, Row
-from benchmarks.trainer import make_trainer, small
+from benchmarks.trainer import running, small
 from benchmarks.worlds import tiled
 
 __all__ = ["measure", "run"]
@@ -46,12 +46,11 @@ def measure(rooms: int, overrides: Sequence[str], seconds: float, threads: int) 
     """States of the world, frames a second of complete updates, and the main process's peak memory in MiB."""
     torch.set_num_threads(threads)
     scenes = tiled(rooms)
-    trainer = make_trainer(overrides, scenes)
-    trainer.update()
-    torch.set_num_threads(threads)
-    began, frames = time.perf_counter(), 0
-    while not frames or time.perf_counter() - began < seconds:
-        frames += trainer.update()
-    speed = frames / (time.perf_counter() - began)
-    trainer.close()
+    with running(overrides, scenes) as ours:
+        ours.update()
+        torch.set_num_threads(threads)
+        began, frames = time.perf_counter(), 0
+        while not frames or time.perf_counter() - began < seconds:
+            frames += ours.update()
+        speed = frames / (time.perf_counter() - began)
     return scenes.num_states, speed, peak_so_far()

@@ -17,7 +17,7 @@ from tensordict.nn import TensorDictModule, TensorDictModuleBase
 
 from benchmarks.peers.sb3 import make_sb3, sb3_actions
 from benchmarks.report import Options, Report, Requirement, Row, number
-from benchmarks.trainer import make_trainer, small
+from benchmarks.trainer import running, small
 from vusfa.evaluation import evaluate
 from vusfa.evaluation.metrics import length_ratio, success_rate
 from vusfa.modules.presets import MODELS
@@ -112,28 +112,27 @@ def run(options: Options) -> Report:
     torch.set_num_threads(options.threads)
     outcomes: dict[str, Outcome] = {}
     for model in MODELS:
-        trainer = make_trainer([f"agent.model={model}", *small(options)])
-        session = trainer.session
-        check = checker(
-            trainer.actor, session.scenes, session.goals, session.agent.config["history"], options
-        )
-        outcomes[model] = train_until(trainer.update, check, cap, every, trainer.cfg.total_frames)
-        trainer.close()
+        with running([f"agent.model={model}", *small(options)]) as ours:
+            trainer = ours.trainer
+            history = trainer.agent.config["history"]
+            check = checker(trainer.actor, trainer.scenes, trainer.goals, history, options)
+            frames = trainer.settings["total_frames"]
+            outcomes[model] = train_until(ours.update, check, cap, every, frames)
     peers: dict[str, Outcome] = {}
     for name, settings in PEERS.items():
-        num_envs, history = trainer.cfg.collector.num_envs, session.agent.config["history"]
+        num_envs = trainer.settings["collector"]["num_envs"]
         model_ = make_sb3(
             name,
-            session.scenes,
-            session.goals,
+            trainer.scenes,
+            trainer.goals,
             num_envs=num_envs,
-            width=session.agent.config["hidden_size"],
+            width=trainer.agent.config["hidden_size"],
             history=history,
             **settings,
         )
         peers[f"SB3 {name}"] = train_until(
             _learner(model_, num_envs * settings["n_steps"]),
-            checker(_policy(model_), session.scenes, session.goals, history, options),
+            checker(_policy(model_), trainer.scenes, trainer.goals, history, options),
             cap,
             every,
         )

@@ -1,27 +1,26 @@
-"""Training updates as ``recipes/train.py`` makes them, one at a time, without files and log lines.
+"""Updates of the trainer that ``vusfa train`` makes, one at a time, without files and log lines.
 
-The settings are the recipe's own, composed from ``vusfa/conf`` as its command line would, and the calls are
-the recipe's: what is measured is what a user gets. ``tests/benchmarks/test_trainer.py`` holds the two to one
-another, weight for weight.
+The settings are the recipe's own, composed from ``vusfa/conf`` as its command line would:
+``tests/benchmarks/test_trainer.py`` compares the weights of both.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from contextlib import ExitStack
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
 from typing import Any
 
-import torch
 from omegaconf import DictConfig, OmegaConf
+from tensordict import TensorDictBase
 
 from benchmarks.report import Options
+from vusfa.conf import FOLDER as CONF
 from vusfa.scenes import SceneSet
-from vusfa.training import make_training
+from vusfa.training import Trainer, make_trainer
 from vusfa.training.launch import compose
 
-__all__ = ["CONF", "Trainer", "make_trainer", "recipe_settings", "small"]
-
-from vusfa.conf import FOLDER as CONF
+__all__ = ["CONF", "Running", "recipe_settings", "running", "small"]
 
 
 def recipe_settings(overrides: Sequence[str] = ()) -> DictConfig:
@@ -35,55 +34,39 @@ def recipe_settings(overrides: Sequence[str] = ()) -> DictConfig:
     return cfg
 
 
-class Trainer:
-    """One training, update by update.
-
-    Args:
-        cfg: the recipe's settings, see :func:`recipe_settings`.
-        scenes: the world; opened as the settings say when not given.
+@dataclass
+class Running:
+    """A trainer that collects, as works to measure.
 
     Attributes:
-        session: the recipe's, with agent, loss, optimiser, frames and meters.
-        batches: the collector's.
+        trainer: with the recipe's settings.
+        batches: its collector's.
     """
 
-    def __init__(self, cfg: DictConfig, scenes: SceneSet | None = None) -> None:
-        self.cfg = cfg
-        plain: dict[str, Any] = OmegaConf.to_container(cfg, resolve=True)  # type: ignore[assignment]
-        self._training = make_training(plain, scenes=scenes)
-        self.session, self.actor = self._training.session, self._training.actor
-        self._open = ExitStack()
-        self.batches = self._open.enter_context(self.session.collecting(self._training.make_collector))
-
-    @property
-    def agent(self) -> torch.nn.Module:
-        """What learns."""
-        return self.session.agent
+    trainer: Trainer
+    batches: Iterator[TensorDictBase]
 
     def collect(self) -> int:
-        """Collect one batch and throw it away; the frames it has."""
-        return self._training.collect(self.batches).numel()
+        """Collects one batch and drops it; its frames."""
+        return self.trainer.collect(self.batches).numel()
 
     def update(self) -> int:
-        """Collect, compute returns and loss, step the optimiser; the frames that it took."""
-        batch, terms = self._training.update(self.batches)
-        self.session.count(batch, terms, 0.0)
-        return batch.numel()
-
-    def close(self) -> None:
-        """End the collector's processes."""
-        self._open.close()
+        """One update; its frames."""
+        return self.trainer.update(self.batches)[0].numel()
 
 
-def make_trainer(overrides: Sequence[str] = (), scenes: SceneSet | None = None) -> Trainer:
-    """A training with the recipe's settings and what is said otherwise.
+@contextmanager
+def running(overrides: Sequence[str] = (), scenes: SceneSet | None = None) -> Iterator[Running]:
+    """A trainer with the recipe's settings but for the overrides; its processes end with the context.
 
-    >>> trainer = make_trainer(["scenes=[bathroom]", "agent.hidden_size=8", "agent.embedding_size=8"])
-    >>> trainer.update() == trainer.cfg.collector.num_envs * trainer.cfg.collector.rollout
+    >>> with running(["scenes=[bathroom]", "agent.hidden_size=8", "agent.embedding_size=8"]) as ours:
+    ...     ours.update() == 256 * 50
     True
-    >>> trainer.close()
     """
-    return Trainer(recipe_settings(overrides), scenes)
+    settings: Any = OmegaConf.to_container(recipe_settings(overrides))
+    trainer = make_trainer(settings, scenes=scenes)
+    with trainer.collecting() as batches:
+        yield Running(trainer, batches)
 
 
 def small(options: Options) -> list[str]:

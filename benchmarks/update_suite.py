@@ -10,7 +10,7 @@ from benchmarks.peers.feature_fed import feature_fed
 from benchmarks.peers.sb3 import make_sb3
 from benchmarks.report import Options, Report, Requirement, Row
 from benchmarks.timing import Timing, Work, interleaved, ratio
-from benchmarks.trainer import Trainer, make_trainer, small
+from benchmarks.trainer import Running, running, small
 
 __all__ = ["RELEASED", "run"]
 
@@ -32,24 +32,23 @@ def run(options: Options) -> Report:
 
 def _works(history: int, options: Options, stack: ExitStack) -> dict[str, Work]:
     overrides = ["agent.model=vusfa", f"agent.history={history}", *small(options)]
-    ours = make_trainer(overrides)
-    fed = feature_fed(overrides)
-    stack.callback(ours.close)
-    stack.callback(fed.close)
-    bare = BareTraining(ours)
+    ours = stack.enter_context(running(overrides))
+    fed = stack.enter_context(feature_fed(overrides))
+    bare = BareTraining(ours.trainer)
     calls = {"ours": ours.update, "bare update": bare.update, "features": fed.update}
     works = {name: Work(call, options.threads) for name, call in calls.items()}
     works["ours, 1 thread"] = Work(ours.update)
     works["bare update, 1 thread"] = Work(bare.update)
     # as many environments and steps as ours, and SB3's own five steps; the faster of the two counts
-    for steps in sorted({5, int(ours.cfg.collector.rollout)}):
+    for steps in sorted({5, ours.trainer.settings["collector"]["rollout"]}):
         works[f"SB3 A2C, {steps} steps"] = Work(_sb3_update(ours, history, steps), options.threads)
     return works
 
 
-def _sb3_update(ours: Trainer, history: int, steps: int) -> Callable[[], int]:
-    num_envs, width = int(ours.cfg.collector.num_envs), ours.session.agent.config["hidden_size"]
-    scenes, goals = ours.session.scenes, ours.session.goals
+def _sb3_update(ours: Running, history: int, steps: int) -> Callable[[], int]:
+    trainer = ours.trainer
+    num_envs, width = trainer.settings["collector"]["num_envs"], trainer.agent.config["hidden_size"]
+    scenes, goals = trainer.scenes, trainer.goals
     model = make_sb3("A2C", scenes, goals, num_envs=num_envs, width=width, history=history, n_steps=steps)
 
     def update() -> int:

@@ -10,20 +10,20 @@ from __future__ import annotations
 from pathlib import Path
 
 from omegaconf import DictConfig
-from train import train
 
 from vusfa.conf import FOLDER as CONF
 from vusfa.evaluation.curve import plot_curve
 from vusfa.evaluation.film import draw_film, longest_success, record_walk, write_gif
+from vusfa.experiments.training import train
 from vusfa.training.launch import launch
 
 
 def demo(cfg: DictConfig, overrides: list[str]) -> int:
     """Trains as recipes/train.py does; then the film and the curve."""
-    session, result, exit_code = train(cfg, overrides)
+    trainer, result, exit_code = train(cfg, overrides)
     if result is None:
         return exit_code
-    folder, agent, scenes = Path(cfg.folder), session.agent.eval(), session.scenes
+    folder, agent, scenes = Path(cfg.folder), trainer.agent.eval(), trainer.scenes
     made, within = [], f"success_{cfg.evaluation.max_steps}"
     if (folder / "metrics.csv").is_file():  # nothing is logged when there was nothing left to train
         floors = [row for row in result.rows if (row["policy"], row["goals"]) == ("random walk", "trained")]

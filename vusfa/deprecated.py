@@ -22,6 +22,9 @@ MOVED_MODULES: dict[str, str] = {
     "vusfa.evaluation.files": "vusfa.files",
     "vusfa.scenes.faults": "vusfa.scenes.validation",
     "vusfa.training.cells": "vusfa.experiments.cells",
+    "vusfa.training.learning": "vusfa.training.optimization",
+    "vusfa.training.replay": "vusfa.algorithms.replay",
+    "vusfa.training.session": "vusfa.training.trainer",
     "vusfa.training.transfer": "vusfa.experiments.fine_tune",
     **{
         f"vusfa.evaluation.{name}": f"vusfa.experiments.{name}"

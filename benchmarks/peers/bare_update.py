@@ -1,7 +1,7 @@
 """A complete update in plain PyTorch: collect, returns, loss, backward, optimiser. One page, no library.
 
 The same losses, targets, coefficients, optimiser and numbers of environments and steps as a
-:class:`benchmarks.trainer.Trainer`, whose weights it begins with; ``tests/benchmarks/test_bare_update.py``
+:class:`vusfa.training.Trainer`, whose weights it begins with; ``tests/benchmarks/test_bare_update.py``
 compares loss terms and gradients with :class:`vusfa.objectives.USFLoss`. Weights stand still between
 collecting and stepping, so the table of encoded states is computed once for both. It counts no episodes and
 writes no log.
@@ -9,15 +9,14 @@ writes no log.
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
-from omegaconf import OmegaConf
 from torch import Tensor
 
 from benchmarks.peers.bare_env import BareEnv
 from benchmarks.peers.bare_network import BareNetwork, Goals, Outputs, Rows, group
-from benchmarks.trainer import Trainer
+from vusfa.training import Trainer
 
 __all__ = ["BareTraining", "Batch", "Noise", "Targets"]
 
@@ -68,22 +67,22 @@ class BareTraining:
     """
 
     def __init__(self, trainer: Trainer) -> None:
-        cfg: Any = OmegaConf.to_container(trainer.cfg, resolve=True)
+        cfg = trainer.settings
         self.optim, self.objective, self.entropy = cfg["optim"], cfg["objective"], cfg["entropy"]
         if self.optim["kind"] != "adam" or self.objective["n_steps"] is not None:
             raise ValueError("BareTraining knows optim.kind=adam and objective.n_steps=null alone")
-        session, env = trainer.session, cfg["env"]
-        self.net = BareNetwork(session.agent, half=cfg["autocast"])
+        env = cfg["env"]
+        self.net = BareNetwork(trainer.agent, half=cfg["autocast"])
         self.params = list(self.net.params.values())
-        self.goal_ids = session.goals
-        self.slot = torch.zeros(session.scenes.num_states, dtype=torch.int64)
+        self.goal_ids = trainer.goals
+        self.slot = torch.zeros(trainer.scenes.num_states, dtype=torch.int64)
         self.slot[self.goal_ids] = torch.arange(len(self.goal_ids))
         self.steps = cfg["collector"]["rollout"]
         self.env = BareEnv(
-            session.scenes,
+            trainer.scenes,
             self.goal_ids,
             cfg["collector"]["num_envs"],
-            history=session.agent.config["history"],
+            history=trainer.agent.config["history"],
             max_steps=env["max_steps"],
             sampling=env["goal_sampling"],
             goal_reward=env["goal_reward"],

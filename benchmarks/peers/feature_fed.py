@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import AbstractContextManager
 
-from benchmarks.trainer import Trainer, make_trainer
+from benchmarks.trainer import Running, running
 from vusfa.scenes import SceneSet
 
 __all__ = ["feature_fed"]
 
 
-def feature_fed(overrides: Sequence[str] = (), scenes: SceneSet | None = None) -> Trainer:
+def feature_fed(
+    overrides: Sequence[str] = (), scenes: SceneSet | None = None
+) -> AbstractContextManager[Running]:
     """The recipe's training with ``agent.observation=features``, its own way to be fed so."""
-    return make_trainer([*overrides, "agent.observation=features"], scenes)
+    return running([*overrides, "agent.observation=features"], scenes)

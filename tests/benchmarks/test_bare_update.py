@@ -7,7 +7,7 @@ import torch
 
 from benchmarks.peers.bare_network import group
 from benchmarks.peers.bare_update import BareTraining, Batch, Noise
-from benchmarks.trainer import make_trainer
+from benchmarks.trainer import running
 from vusfa.training import total_loss
 
 
@@ -30,17 +30,17 @@ def _as_bare(batch, bare: BareTraining) -> Batch:
 def test_loss_and_gradients_are_those_of_the_library(model: str, history: int, tiny):
     threads = torch.get_num_threads()
     overrides = [f"agent.model={model}", f"agent.history={history}", "collector.rollout=12"]
-    trainer = make_trainer(tiny(*overrides, "collector.num_envs=16", "objective.lmbda=0.9", "autocast=false"))
-    bare, session = BareTraining(trainer), trainer.session
-    session.loss.entropy_coeff = trainer.cfg.entropy.start
-    if model == "vusfa":
-        session.loss.bottleneck_coeff = 0.3
-        bare.beta = torch.tensor(0.3)
-        session.agent.latent.noise = torch.zeros_like  # the draws come in another order
-    batch = next(trainer.batches).clone()
+    with running(tiny(*overrides, "collector.num_envs=16", "objective.lmbda=0.9", "autocast=false")) as ours:
+        trainer = ours.trainer
+        bare, loss = BareTraining(trainer), trainer.algorithm.loss
+        loss.entropy_coeff = trainer.settings["entropy"]["start"]
+        if model == "vusfa":
+            loss.bottleneck_coeff = 0.3
+            bare.beta = torch.tensor(0.3)
+            trainer.agent.latent.noise = torch.zeros_like  # the draws come in another order
+        batch = next(ours.batches).clone()
     assert batch["next", "done"].any()
-    loss = session.loss
-    expected = total_loss(loss, loss(batch))
+    expected = total_loss(loss(batch))
     expected.backward()
     plain = _as_bare(batch, bare)
     net = bare.net
@@ -50,19 +50,18 @@ def test_loss_and_gradients_are_those_of_the_library(model: str, history: int, t
     noise = Noise(zeros, zeros[:1].expand(ends, 8), zeros) if model == "vusfa" else Noise(None, None, None)
     found, _ = bare.loss(w, net.states(w), net.goals(w, bare.goal_ids), plain, noise)
     found.backward()
-    trainer.close()
     torch.set_num_threads(threads)
     torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-6)
-    for (name, theirs), ours in zip(net.params.items(), session.agent.parameters(), strict=True):
-        scale = float(ours.grad.abs().max())
-        torch.testing.assert_close(theirs.grad, ours.grad, rtol=1e-3, atol=1e-4 * scale + 1e-9, msg=name)
+    for (name, theirs), param in zip(net.params.items(), trainer.agent.parameters(), strict=True):
+        scale = float(param.grad.abs().max())
+        torch.testing.assert_close(theirs.grad, param.grad, rtol=1e-3, atol=1e-4 * scale + 1e-9, msg=name)
 
 
 @pytest.mark.parametrize("history", [1, 4])
 @pytest.mark.parametrize("model", ["gvf", "vusfa"])
 def test_acting_leaves_out_what_logits_do_not_need(model: str, history: int, tiny):
-    trainer = make_trainer(tiny(f"agent.model={model}", f"agent.history={history}", "autocast=false"))
-    bare, batch = BareTraining(trainer), next(trainer.batches)
+    with running(tiny(f"agent.model={model}", f"agent.history={history}", "autocast=false")) as ours:
+        bare, batch = BareTraining(ours.trainer), next(ours.batches)
     plain = _as_bare(batch, bare)
     columns = plain.state.flatten(0, 1), plain.goal.flatten(), plain.scene.flatten()
     rows, w = group(*columns, bare.net.num_scenes), bare.net.weights()
@@ -70,23 +69,19 @@ def test_acting_leaves_out_what_logits_do_not_need(model: str, history: int, tin
     every, some = (bare.net.rows(w, states, goals, rows, acting=acting) for acting in (False, True))
     assert some.scale is None
     torch.testing.assert_close(some.logits, every.logits)
-    trainer.close()
 
 
 def test_updates_move_every_weight_and_the_multiplier(tiny):
-    trainer = make_trainer(tiny("agent.model=vusfa"))
-    bare = BareTraining(trainer)
+    with running(tiny("agent.model=vusfa")) as ours:
+        bare = BareTraining(ours.trainer)
     before = [param.detach().clone() for param in bare.params]
     assert [bare.update() for _ in range(4)] == [24] * 4
     assert bare.frames == 96
     assert bare.beta > 0
     for old, new in zip(before, bare.params, strict=True):
         assert not torch.equal(old, new)
-    trainer.close()
 
 
 def test_what_it_does_not_know_is_refused(tiny):
-    trainer = make_trainer(tiny("optim=rmsprop"))
-    with pytest.raises(ValueError, match="adam"):
-        BareTraining(trainer)
-    trainer.close()
+    with running(tiny("optim=rmsprop")) as ours, pytest.raises(ValueError, match="adam"):
+        BareTraining(ours.trainer)

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from benchmarks.trainer import make_trainer, recipe_settings
+from benchmarks.trainer import recipe_settings, running
 from vusfa.training import load_checkpoint
 
 
@@ -23,11 +23,10 @@ def test_weights_are_those_of_the_recipe(model: str, tiny, tmp_path: Path, monke
     sys.modules.pop("train")
     theirs = load_checkpoint(tmp_path / "checkpoint.pt")["agent"]
     # with the recipe's number of threads still: another one sums in another order
-    trainer = make_trainer(overrides)
-    assert [trainer.update() for _ in range(3)] == [24, 24, 24]
-    trainer.close()
+    with running(overrides) as measured:
+        assert [measured.update() for _ in range(3)] == [24, 24, 24]
     torch.set_num_threads(threads)
-    ours = trainer.agent.state_dict()
+    ours = measured.trainer.agent.state_dict()
     assert ours.keys() == theirs.keys()
     for name, value in ours.items():
         torch.testing.assert_close(value, theirs[name], rtol=0, atol=0)

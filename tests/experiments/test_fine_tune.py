@@ -14,9 +14,8 @@ from vusfa.evaluation.metrics import length_ratio
 from vusfa.experiments.fine_tune import fine_tune, fine_tuning_settings
 from vusfa.modules import ActingPolicy
 from vusfa.scenes import SceneSet
-from vusfa.training import load_agent
+from vusfa.training import load_agent, make_trainer
 from vusfa.training.launch import compose
-from vusfa.training.setup import make_training
 
 
 @pytest.fixture
@@ -42,12 +41,12 @@ def config(scene_file: Path) -> dict[str, Any]:
 @pytest.fixture
 def checkpoint_of(tmp_path: Path) -> Callable[[dict[str, Any]], Path]:
     def make(config: dict[str, Any]) -> Path:
-        training = make_training(config)
-        with training.session.collecting(training.make_collector) as batches:
-            training.update(batches)
+        trainer = make_trainer(config)
+        with trainer.collecting() as batches:
+            trainer.update(batches)
             with torch.no_grad():
-                training.session.loss.bottleneck_coeff.fill_(0.25)
-            return training.session.save(tmp_path / "checkpoint.pt")
+                trainer.algorithm.loss.bottleneck_coeff.fill_(0.25)
+            return trainer.save(tmp_path / "checkpoint.pt")
 
     return make
 
@@ -86,20 +85,18 @@ def test_trained_on_begins_where_the_agent_was_and_scratch_does_not(
     settings = fine_tuning_settings(state["config"], torch.tensor([5]), frames=24, seed=9)
 
     def made(settings: dict[str, Any], scenes: SceneSet) -> Any:
-        training = make_training(settings, scenes=scenes)
-        collecting: Callable[..., Any] = training.session.collecting
+        trainer = make_trainer(settings, scenes=scenes)
+        collecting: Callable[..., Any] = trainer.collecting
 
-        def kept(make: Any) -> Any:
-            beta = training.session.loss.bottleneck_coeff.item()
-            seen.append(
-                {"beta": beta, **{k: v.clone() for k, v in training.session.agent.state_dict().items()}}
-            )
-            return collecting(make)
+        def kept() -> Any:
+            beta = trainer.algorithm.loss.bottleneck_coeff.item()
+            seen.append({"beta": beta, **{k: v.clone() for k, v in trainer.agent.state_dict().items()}})
+            return collecting()
 
-        monkeypatch.setattr(training.session, "collecting", kept)
-        return training
+        monkeypatch.setattr(trainer, "collecting", kept)
+        return trainer
 
-    monkeypatch.setattr("vusfa.experiments.fine_tune.make_training", made)
+    monkeypatch.setattr("vusfa.experiments.fine_tune.make_trainer", made)
     for start in (state, None):
         fine_tune(start, settings, scenes, every=1000)
     weight = next(name for name in state["agent"] if name.endswith("weight"))

@@ -34,6 +34,7 @@ def test_every_file_opens_with_the_line_that_launches_it(path: Path):
 def test_the_groups_mirror_the_package():
     assert {path.name for path in CONF.iterdir() if path.is_dir() and path.name != "__pycache__"} == {
         "agent",
+        "algorithm",
         "collector",
         "env",
         "evaluation",

@@ -53,14 +53,14 @@ class Simulator:
 def trains(
     recipe: Callable[[str], Any], settings: Callable[..., Any], small: list[str], tmp_path: Path
 ) -> Callable[[Path], Any]:
-    """Trains on a scene file for 20 updates; the session."""
+    """Trains on a scene file for 20 updates; the trainer."""
 
     def train(path: Path) -> Any:
         options = [f"scenes=[{path}]", f"folder={tmp_path / 'run'}"]
-        session, _, code = recipe("train").train(settings(*small, *options), options)
-        assert (session.updates, code) == (20, 0)
-        assert all(bool(parameter.isfinite().all()) for parameter in session.agent.parameters())
-        return session
+        trainer, _, code = recipe("train").train(settings(*small, *options), options)
+        assert (trainer.updates, code) == (20, 0)
+        assert all(bool(parameter.isfinite().all()) for parameter in trainer.agent.parameters())
+        return trainer
 
     return train
 

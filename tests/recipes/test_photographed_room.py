@@ -32,6 +32,6 @@ def test_from_photographs_to_a_training(
     words = ["scenes", "from-photos", tmp_path, "-o", target, "--features", tmp_path / "features.npy"]
     assert CliRunner().invoke(app, [str(word) for word in words]).exit_code == 0
     options = [f"scenes=[{target}]", f"folder={tmp_path / 'run'}"]
-    session, _, code = recipe("train").train(settings(*small, *options), options)
-    assert (session.updates, code) == (20, 0)
-    assert session.scenes.names == ("photos",)
+    trainer, _, code = recipe("train").train(settings(*small, *options), options)
+    assert (trainer.updates, code) == (20, 0)
+    assert trainer.scenes.names == ("photos",)

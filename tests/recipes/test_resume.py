@@ -41,7 +41,7 @@ def assert_equal(one, other, where: str = "") -> None:
         ["agent.model=gvf", "optim=tf_rmsprop"],
         ["agent.model=usfa", "agent=lstm", "env.goal_sampling=episode"],
         ["agent.model=sfdp", "autocast=true"],
-        ["agent.model=vusfa", "hindsight=replay", "hindsight.batch_size=16", "hindsight.updates=2"],
+        ["agent.model=vusfa", "algorithm=hindsight", "hindsight.batch_size=16", "hindsight.updates=2"],
     ],
     ids=["vusfa", "gvf", "lstm", "autocast", "hindsight"],
 )
@@ -77,7 +77,7 @@ def test_resumed_equals_uninterrupted(
 
     assert run("whole") == 0
     with monkeypatch.context() as patch:
-        patch.setattr(module, "StopOnSignal", Interruption)
+        patch.setattr("vusfa.experiments.training.StopOnSignal", Interruption)
         assert run("parts") == 143
     assert load_checkpoint(tmp_path / "parts" / "checkpoint.pt")["frames"] == 17 * 24
     torch.manual_seed(12345)  # a new process begins anywhere
@@ -105,7 +105,7 @@ def test_the_run_keeps_its_name(recipe, settings, small, tmp_path: Path):
         (["agent.hidden_size=16"], "saved with agent.hidden_size=8, not 16"),
         (["env.goals=[3,9,13]"], r"saved with env.goals=\[3, 9, 12\], not \[3, 9, 13\]"),
         (["collector.num_envs=9"], r"the checkpoint holds \[6\] environments, the collector \[9\]"),
-        (["optim=tf_rmsprop"], "its optimiser is not a TFRMSprop"),
+        (["optim=tf_rmsprop"], "its optimizer is not a TFRMSprop"),
     ],
 )
 def test_a_checkpoint_of_another_training_is_refused(
@@ -145,5 +145,5 @@ def test_workers_begin_new_episodes_when_resumed(recipe, settings, small, tmp_pa
     path = tmp_path / "run" / "checkpoint.pt"
     options = [*small, "collector=multi_async", f"folder={path.parent}"]
     train(settings(*options, "total_frames=48"), [])
-    session, _, _ = train(settings(*options, "total_frames=96", f"resume={path}"), [])
-    assert (session.frames, session.updates) == (96, 8)
+    trainer, _, _ = train(settings(*options, "total_frames=96", f"resume={path}"), [])
+    assert (trainer.frames, trainer.updates) == (96, 8)

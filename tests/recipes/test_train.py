@@ -36,14 +36,14 @@ def test_every_model_trains_with_every_collector(
         f"folder={tmp_path / 'run'}",
     ]
     cfg = settings(*small, *options)
-    session, result, code = recipe("train").train(cfg, options)
-    assert (session.updates, session.frames, result, code) == (20, frames, None, 0)
-    assert all(bool(param.isfinite().all()) for param in session.agent.parameters())
+    trainer, result, code = recipe("train").train(cfg, options)
+    assert (trainer.updates, trainer.frames, result, code) == (20, frames, None, 0)
+    assert all(bool(param.isfinite().all()) for param in trainer.agent.parameters())
 
     agent, scenes, state = load_agent(tmp_path / "run" / "checkpoint.pt")
     assert state["frames"] == frames
     for name, value in agent.state_dict().items():
-        assert torch.equal(value, session.agent.state_dict()[name]), name
+        assert torch.equal(value, trainer.agent.state_dict()[name]), name
     table = evaluate(
         agent.get_policy_operator(), scenes, state["goals"], episodes_per_goal=2, max_steps=9, history=2
     )
@@ -114,9 +114,9 @@ def test_options_train(recipe, settings, small, tmp_path: Path, options: list[st
     if any("lstm" in option or "reference" in option for option in options):
         kept.remove("agent.history=2")
     cfg = settings(*kept, *options, "total_frames=480", f"folder={tmp_path / 'run'}")
-    session, _, _ = recipe("train").train(cfg, options)
-    assert session.updates == 20
-    assert all(bool(param.isfinite().all()) for param in session.agent.parameters())
+    trainer, _, _ = recipe("train").train(cfg, options)
+    assert trainer.updates == 20
+    assert all(bool(param.isfinite().all()) for param in trainer.agent.parameters())
     agent, scenes, _ = load_agent(tmp_path / "run" / "checkpoint.pt")
     history, observe = agent.config["history"], make_observation(agent, scenes)
     evaluate(agent.get_policy_operator(), scenes, [3], max_steps=9, history=history, observe=observe)
@@ -135,8 +135,8 @@ def test_all_loggers_hear_of_a_run(
         "evaluation.max_steps=20",
         f"folder={tmp_path / 'run'}",
     ]
-    session, _, _ = recipe("train").train(settings(*small, *options), options)
-    (stored,) = (tmp_path / "run" / "wandb").glob(f"offline-run-*/run-{session.run_id}.wandb")
+    trainer, _, _ = recipe("train").train(settings(*small, *options), options)
+    (stored,) = (tmp_path / "run" / "wandb").glob(f"offline-run-*/run-{trainer.run_id}.wandb")
     words = [
         b"goal/hall/3/success",
         b"scene/hall/length_ratio",
@@ -161,12 +161,12 @@ def test_the_multiplier_moves_and_the_rate_falls(recipe, settings, small, tmp_pa
         "optim.horizon=480",
         f"folder={tmp_path / 'run'}",
     ]
-    session, _, _ = recipe("train").train(settings(*small, *options), options)
+    trainer, _, _ = recipe("train").train(settings(*small, *options), options)
     log = rows(tmp_path / "run" / "metrics.csv")
     betas = [float(line["beta"]) for line in log]
     assert betas == sorted(betas)
     assert betas[-1] > betas[0]
-    assert float(session.loss.bottleneck_coeff) > betas[-1]
+    assert float(trainer.algorithm.loss.bottleneck_coeff) > betas[-1]
     rates = [float(line["lr"]) for line in log]
     lr = settings(*small).optim.lr
     assert rates[0] == pytest.approx(lr * (1 - 24 / 480))

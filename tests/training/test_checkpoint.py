@@ -12,13 +12,8 @@ import torch
 
 from vusfa.errors import CheckpointError
 from vusfa.scenes import Scene, SceneSet
-from vusfa.training.checkpoint import (
-    check_scenes,
-    load_checkpoint,
-    random_state,
-    restore_random_state,
-    save_checkpoint,
-)
+from vusfa.training.checkpoint import check_scenes, load_checkpoint, save_checkpoint
+from vusfa.training.random_state import random_state, restore_random_state
 
 STATE = {
     "agent_config": {},

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import os
 import signal
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from functools import partial
 
 import pytest
@@ -15,8 +16,8 @@ from torchrl.collectors import BaseCollector
 from vusfa.errors import ConfigError, GoalError
 from vusfa.modules import Agent, make_agent
 from vusfa.scenes import Scene, SceneSet
-from vusfa.training import Session, check_goals_dealt, make_collector, make_env, make_loss
-from vusfa.training.collectors import rows_per_worker
+from vusfa.training import check_goals_dealt, make_collector, make_env
+from vusfa.training.collectors import opened, rows_per_worker
 
 GOALS = torch.tensor([3, 9, 12])
 
@@ -42,18 +43,10 @@ def open_collector(kind: str, rooms: SceneSet, agent: Agent, **settings) -> Base
     return make_collector(kind, env, agent.get_policy_operator(), **wanted)
 
 
-def in_session(rooms: SceneSet, agent: Agent, make: Callable[[], BaseCollector]):
-    loss, _, _ = make_loss(
-        agent.get_policy_operator(),
-        agent.get_value_operator(),
-        objective_coeff=1.0,
-        critic_coeff=1.0,
-        entropy_coeff=0.0,
-        successor_coeff=0.0,
-        bottleneck_coeff=0.0,
-        bottleneck_step_size=0.0,
-    )
-    return Session(rooms, GOALS, agent, loss, torch.optim.Adam(agent.parameters()), {}).collecting(make)
+@contextmanager
+def batches_of(make: Callable[[], BaseCollector]) -> Iterator[Iterator[TensorDictBase]]:
+    with opened(make) as collector:
+        yield iter(collector)
 
 
 class Kept:
@@ -77,7 +70,7 @@ def prefer(agent: Agent, action: int) -> None:
 
 
 def test_single(rooms: SceneSet, agent: Agent):
-    with in_session(rooms, agent, lambda: open_collector("single", rooms, agent)) as batches:
+    with batches_of(lambda: open_collector("single", rooms, agent)) as batches:
         batch = next(batches)
         assert batch.shape == (6, 4)
         assert batch["goal_id"][:, 0].tolist() == [3, 9, 12, 3, 9, 12]
@@ -93,7 +86,7 @@ def test_workers_in_step(rooms: SceneSet):
     for _ in range(2):
         agent = untrained(rooms)
         make = Kept("multi_sync", rooms, agent, num_envs=4)
-        with in_session(rooms, agent, make) as batches:
+        with batches_of(make) as batches:
             batch = next(batches).clone()
             assert batch.shape == (4, 4)
             assert batch["goal_id"][:, 0].tolist() == [3, 9, 12, 3]  # two rows of either worker
@@ -115,7 +108,7 @@ def test_workers_at_their_own_pace(rooms: SceneSet, agent: Agent):
         return [next(batches) for _ in range(count)]
 
     make = Kept("multi_async", rooms, agent, num_envs=6)
-    with in_session(rooms, agent, make) as batches:
+    with batches_of(make) as batches:
         first = take(batches, 6)
         assert {batch.shape for batch in first} == {(3, 4)}
         assert all(batch["goal_id"][:, 0].tolist() == [3, 9, 12] for batch in first)

@@ -18,9 +18,9 @@ from vusfa.experiments.manifest import BUNDLED_MANIFEST, Manifest, make_manifest
 from vusfa.experiments.results import Cell
 from vusfa.modules import ActingPolicy, Agent, sees_one_frame
 from vusfa.scenes import SceneSet
+from vusfa.training import load_agent, make_observation
 from vusfa.training.facts import run_facts
 from vusfa.training.progress import EvaluationProgress
-from vusfa.training.session import load_agent, make_observation
 
 __all__ = [
     "choose_checkpoint",

@@ -14,7 +14,7 @@ from vusfa.evaluation.metrics import length_ratio
 from vusfa.evaluation.tabulated import TabulatedPolicy
 from vusfa.modules import ActingPolicy, sees_one_frame
 from vusfa.scenes import SceneSet
-from vusfa.training.setup import Training, make_training
+from vusfa.training import Trainer, make_trainer
 
 __all__ = ["fine_tune", "fine_tuning_settings"]
 
@@ -62,49 +62,46 @@ def fine_tune(
     Returns:
         the curve: ``frames``, and at each ``length`` (actions), ``success`` and ``length_ratio``.
     """
-    training = make_training(settings, scenes=scenes)
-    session = training.session
+    trainer = make_trainer(settings, scenes=scenes)
     if state is not None:
-        session.adopt(state)
+        trainer.load_weights(state)
     curve: dict[str, list[float]] = {key: [] for key in ("frames", "length", "success", "length_ratio")}
 
     def look() -> None:
-        seen = _expected(training) if sees_one_frame(session.agent) else _walked(training, episodes_per_goal)
-        for key, value in zip(curve, (float(session.frames), *seen), strict=True):
+        seen = _expected(trainer) if sees_one_frame(trainer.agent) else _walked(trainer, episodes_per_goal)
+        for key, value in zip(curve, (float(trainer.frames), *seen), strict=True):
             curve[key].append(value)
 
     look()
-    with session.collecting(training.make_collector) as batches:
-        while session.frames < settings["total_frames"]:
-            before = session.frames
-            batch, terms = training.update(batches)
-            session.count(batch, terms, 0.0)
-            ended = session.frames >= settings["total_frames"]
-            if ended or before // every < session.frames // every:
+    with trainer.collecting() as batches:
+        while trainer.frames < settings["total_frames"]:
+            before = trainer.frames
+            trainer.update(batches)
+            ended = trainer.frames >= settings["total_frames"]
+            if ended or before // every < trainer.frames // every:
                 look()
     return curve
 
 
-def _expected(training: Training) -> tuple[float, float, float]:
+def _expected(trainer: Trainer) -> tuple[float, float, float]:
     """Length, success and length over shortest path of an agent that sees one frame: computed."""
-    session, steps = training.session, training.settings["env"]["max_steps"]
-    policy = TabulatedPolicy(session.agent, session.scenes, session.goals)
-    walks = expected_walks(policy.probabilities, session.scenes, session.goals, steps)
+    steps = trainer.settings["env"]["max_steps"]
+    policy = TabulatedPolicy(trainer.agent, trainer.scenes, trainer.goals)
+    walks = expected_walks(policy.probabilities, trainer.scenes, trainer.goals, steps)
     return walks.length.mean().item(), walks.success.mean().item(), walks.length_ratio
 
 
-def _walked(training: Training, episodes_per_goal: int) -> tuple[float, float, float]:
+def _walked(trainer: Trainer, episodes_per_goal: int) -> tuple[float, float, float]:
     """The same of any other: of episodes that are walked."""
-    session = training.session
     table = evaluate(
-        training.actor if session.agent.memory is not None else ActingPolicy(session.agent),
-        session.scenes,
-        session.goals,
+        trainer.actor if trainer.agent.memory is not None else ActingPolicy(trainer.agent),
+        trainer.scenes,
+        trainer.goals,
         episodes_per_goal=episodes_per_goal,
-        max_steps=training.settings["env"]["max_steps"],
-        history=session.agent.config["history"],
+        max_steps=trainer.settings["env"]["max_steps"],
+        history=trainer.agent.config["history"],
         seed=0,
-        observe=training.observation,
+        observe=trainer.observation,
     )
     success, length = table.success, table.length
     mean_length, mean_success = length.double().mean().item(), success.double().mean().item()

@@ -1,39 +1,35 @@
-"""What a training needs around the objectives: collectors, loggers, a progress line, checkpoints.
+"""One trainer, and what it needs: collectors, checkpoints, loggers, a progress line.
 
-``recipes/train.py`` puts them together.
+>>> from vusfa.conf import FOLDER
+>>> (FOLDER / "train.yaml").is_file()  # the settings that make_trainer takes
+True
 """
 
-from vusfa.training.checkpoint import load_checkpoint, save_checkpoint
+from vusfa.deprecated import moved_names
+from vusfa.training.checkpoint import (
+    load_agent,
+    load_checkpoint,
+    rebuild_agent,
+    save_checkpoint,
+    scene_sources,
+)
 from vusfa.training.collectors import check_goals_dealt, make_collector, make_env
 from vusfa.training.facts import machine_facts, run_facts
-from vusfa.training.learning import annealed, descend, make_loss, make_optimiser, total_loss
 from vusfa.training.loggers import make_loggers
 from vusfa.training.metrics import EpisodeMeter, MeanMeter
+from vusfa.training.optimization import descend, make_optimizer, total_loss
 from vusfa.training.progress import EvaluationProgress, ProgressLine
-from vusfa.training.replay import HindsightReplay, HindsightSampler
-from vusfa.training.session import (
-    Session,
-    load_agent,
-    make_observation,
-    rebuild_agent,
-    scene_sources,
-    set_threads,
-    torch_device,
-)
-from vusfa.training.setup import Training, make_training, row_name
+from vusfa.training.setup import make_observation, make_trainer, row_name, set_threads, torch_device
 from vusfa.training.signals import StopOnSignal
+from vusfa.training.trainer import Trainer
 
 __all__ = [
     "EpisodeMeter",
     "EvaluationProgress",
-    "HindsightReplay",
-    "HindsightSampler",
     "MeanMeter",
     "ProgressLine",
-    "Session",
     "StopOnSignal",
-    "Training",
-    "annealed",
+    "Trainer",
     "check_goals_dealt",
     "descend",
     "load_agent",
@@ -42,10 +38,9 @@ __all__ = [
     "make_collector",
     "make_env",
     "make_loggers",
-    "make_loss",
     "make_observation",
-    "make_optimiser",
-    "make_training",
+    "make_optimizer",
+    "make_trainer",
     "rebuild_agent",
     "row_name",
     "run_facts",
@@ -55,3 +50,17 @@ __all__ = [
     "torch_device",
     "total_loss",
 ]
+
+__getattr__ = moved_names(
+    __name__,
+    {
+        "HindsightReplay": "vusfa.algorithms.HindsightReplay",
+        "HindsightSampler": "vusfa.algorithms.HindsightSampler",
+        "annealed": "vusfa.algorithms.annealed",
+        "make_loss": "vusfa.algorithms.make_usf_loss",
+        "make_optimiser": "vusfa.training.optimization.make_optimizer",
+        "make_training": "vusfa.training.setup.make_trainer",
+        "Session": "vusfa.training.trainer.Trainer",
+        "Training": "vusfa.training.trainer.Trainer",
+    },
+)

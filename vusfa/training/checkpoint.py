@@ -12,7 +12,8 @@ a checkpoint runs no code, wherever it comes from. Its entries:
 ``scenes``                 what was given as scenes, their names, and the set's fingerprint
 ``goals``                  (G,) global ids of the goals trained on
 ``config``, ``overrides``  the recipe's resolved configuration and the command line that made it
-``optimiser``, ``loss``    their states; the loss's without the networks, hence multiplier and coefficients
+``optimizer``              its state
+``algorithm``              what it has learned besides the agent: multiplier, replay buffer
 ``collector``              environments and the frame they stand at (:mod:`vusfa.training.collectors`)
 ``meter``                  sums of the episodes since the last line of the log
 ``rng``                    random states: torch, CUDA, numpy, Python
@@ -23,29 +24,40 @@ a checkpoint runs no code, wherever it comes from. Its entries:
 from __future__ import annotations
 
 import os
-import random
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
+from torch import Tensor
 
 from vusfa.errors import CheckpointError
 from vusfa.files import replacing
-from vusfa.scenes import SceneSet
+from vusfa.modules import Agent, make_agent
+from vusfa.scenes import SceneSet, bundled_names
+from vusfa.training.loggers import flat
+from vusfa.training.upgrade import upgrade
 
 __all__ = [
     "FORMAT",
+    "check_fits",
     "check_scenes",
     "check_setting",
+    "differences",
+    "load_agent",
     "load_checkpoint",
-    "random_state",
-    "restore_random_state",
+    "load_optimizer",
+    "load_weights",
+    "rebuild_agent",
     "save_checkpoint",
+    "scene_sources",
 ]
 
-FORMAT = 1
+FORMAT = 2
+# entries of Agent.config that describe the scenes, not the agent
+_OF_SCENES = ("scenes", "fingerprint", "num_actions")
+# settings whose other wording changes nothing: scenes are told apart by their content
+_REWORDED = ("resume", "scenes")
 _ENTRIES = ("agent_config", "agent", "scenes", "goals", "frames")
 
 
@@ -94,9 +106,11 @@ def load_checkpoint(path: str | Path, device: torch.device | str = "cpu") -> dic
         raise CheckpointError(
             f"{path}: no checkpoint of vusfa ({missing[0]!r} is missing); give one of recipes/train.py"
         )
+    if state.get("format") == 1:
+        state = upgrade(state)
     if state.get("format") != FORMAT:
         raise CheckpointError(
-            f"{path}: checkpoint of format {state.get('format')}, this version reads {FORMAT};"
+            f"{path}: checkpoint of format {state.get('format')}, this version reads 1 and {FORMAT};"
             " use the version that wrote it"
         )
     return state
@@ -135,37 +149,102 @@ def check_scenes(path: str | Path, saved: Mapping[str, Any], scenes: SceneSet) -
         )
 
 
-def random_state() -> dict[str, Any]:
-    """The states of all global random generators, as tensors and plain data."""
-    version, internal, gauss = random.getstate()
-    name, keys, position, has_gauss, cached = np.random.get_state(legacy=True)  # noqa: NPY002
-    return {
-        "torch": torch.get_rng_state(),
-        "cuda": torch.cuda.get_rng_state_all() if torch.cuda.is_available() else [],
-        "python": [version, list(internal), gauss],
-        "numpy": [
-            str(name),
-            torch.from_numpy(np.asarray(keys).astype(np.int64)),
-            int(position),
-            int(has_gauss),
-            float(cached),
-        ],
-    }
+def check_fits(
+    path: str | Path, state: Mapping[str, Any], scenes: SceneSet, goals: Tensor, agent: Agent
+) -> None:
+    """Refuse a checkpoint of other scenes, goals, or an agent of another shape.
+
+    Raises:
+        CheckpointError: naming what differs.
+    """
+    check_scenes(path, state["scenes"], scenes)
+    for key, value in agent.config.items():
+        if key not in _OF_SCENES:
+            check_setting(path, f"agent.{key}", state["agent_config"].get(key), value)
+    check_setting(path, "env.goals", state["goals"].tolist(), goals.tolist())
 
 
-def restore_random_state(state: Mapping[str, Any]) -> None:
-    """Put the global random generators back to where :func:`random_state` found them.
+def differences(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
+    """Settings that differ, one line each.
 
-    >>> before = random_state()
-    >>> first = torch.rand(1), random.random(), np.random.rand()
-    >>> restore_random_state(before)
-    >>> first == (torch.rand(1), random.random(), np.random.rand())
+    >>> differences({"optim": {"lr": 0.1}}, {"optim": {"lr": 0.2}})
+    ['optim.lr=0.2 instead of 0.1']
+    """
+    old, new = flat(before), flat(now)
+    keys = [key for key in old.keys() | new.keys() if old.get(key) != new.get(key)]
+    return [f"{key}={new.get(key)} instead of {old.get(key)}" for key in sorted(keys) if key not in _REWORDED]
+
+
+def scene_sources(scenes: str | Sequence[str]) -> list[str]:
+    """What was given as scenes, in a form that still works from another folder.
+
+    >>> scene_sources("kitchen")
+    ['kitchen']
+    """
+    given = [scenes] if isinstance(scenes, str) else list(scenes)
+    return [name if name in bundled_names() else str(Path(name).resolve()) for name in given]
+
+
+def rebuild_agent(config: Mapping[str, Any], scenes: SceneSet) -> Agent:
+    """An untrained agent of the shape that :attr:`vusfa.modules.Agent.config` describes.
+
+    >>> scenes = SceneSet.bundled(["bathroom"])
+    >>> agent = make_agent("gvf", scenes=scenes, hidden_size=8, embedding_size=8)
+    >>> rebuild_agent(agent.config, scenes).config == agent.config
     True
     """
-    torch.set_rng_state(state["torch"].cpu())
-    if state["cuda"] and torch.cuda.is_available():
-        torch.cuda.set_rng_state_all([generator.cpu() for generator in state["cuda"]])
-    version, internal, gauss = state["python"]
-    random.setstate((version, tuple(internal), gauss))
-    name, keys, position, has_gauss, cached = state["numpy"]
-    np.random.set_state((name, keys.cpu().numpy().astype(np.uint32), position, has_gauss, cached))  # noqa: NPY002
+    return make_agent(scenes=scenes, **{k: v for k, v in config.items() if k not in _OF_SCENES})
+
+
+def load_agent(
+    path: str | Path, scenes: SceneSet | None = None, device: torch.device | str = "cpu"
+) -> tuple[Agent, SceneSet, dict[str, Any]]:
+    """The agent of a checkpoint, in evaluation mode, with its scenes.
+
+    Args:
+        path: the checkpoint.
+        scenes: the scenes that it was trained in; opened as they were then, when not given.
+        device: where the agent and the scenes' tables go.
+
+    Returns:
+        agent, scenes and the checkpoint's content.
+
+    Raises:
+        CheckpointError: the file is damaged, or of other scenes.
+        SceneError: its scenes are not where they were.
+    """
+    device = torch.device(device)
+    state = load_checkpoint(path, device)
+    scenes = (SceneSet.open(state["scenes"]["sources"]) if scenes is None else scenes).to(device)
+    check_scenes(path, state["scenes"], scenes)
+    agent = rebuild_agent(state["agent_config"], scenes).to(device)
+    load_weights(agent, state, path)
+    return agent.eval(), scenes, state
+
+
+def load_weights(agent: Agent, state: Mapping[str, Any], path: str | Path) -> None:
+    """Put a checkpoint's weights into an agent.
+
+    Raises:
+        CheckpointError: they are of another model.
+    """
+    try:
+        agent.load_state_dict(state["agent"])
+    except RuntimeError as error:
+        first = str(error).splitlines()[-1].strip()
+        raise CheckpointError(
+            f"{path}: its weights do not fit a {agent.config['model']} agent ({first})"
+        ) from error
+
+
+def load_optimizer(optimizer: torch.optim.Optimizer, state: Mapping[str, Any], path: str | Path) -> None:
+    """The optimizer's memory of gradients; its numbers stay as they are."""
+    saved, settings = state["optimizer"], [dict(group) for group in optimizer.param_groups]
+    if saved["param_groups"][0].keys() != settings[0].keys():
+        raise CheckpointError(
+            f"{path}: its optimizer is not a {type(optimizer).__name__}; leave the setting out,"
+            " or start a new run"
+        )
+    optimizer.load_state_dict(saved)
+    for group, numbers in zip(optimizer.param_groups, settings, strict=True):
+        group.update({key: value for key, value in numbers.items() if key != "params"})

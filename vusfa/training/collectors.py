@@ -12,7 +12,8 @@ All rows are dealt the same goals whichever way they are spread over processes.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from functools import partial
 from typing import Any
 
@@ -36,6 +37,7 @@ __all__ = [
     "load_collector_state",
     "make_collector",
     "make_env",
+    "opened",
     "rows_per_worker",
 ]
 
@@ -174,6 +176,21 @@ def _begin_worker(autocast: bool) -> None:
         torch.set_autocast_enabled("cpu", True)
         # The cache would keep weights converted before an update for as long as the worker lives.
         torch.set_autocast_cache_enabled(False)
+
+
+@contextmanager
+def opened(make: Callable[[], BaseCollector]) -> Iterator[BaseCollector]:
+    """A collector within a context that ends its processes.
+
+    A collector with workers changes this process's number of threads; that is put right.
+    """
+    threads = torch.get_num_threads()
+    collector = make()
+    try:
+        yield collector
+    finally:
+        close_collector(collector)
+        torch.set_num_threads(threads)
 
 
 def close_collector(collector: BaseCollector) -> None:

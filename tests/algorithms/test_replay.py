@@ -10,9 +10,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from tensordict import TensorDict
 
+from vusfa.algorithms import HindsightReplay, HindsightSampler
+from vusfa.algorithms.replay import steps_ahead
 from vusfa.errors import ConfigError
-from vusfa.training import HindsightReplay, HindsightSampler
-from vusfa.training.replay import steps_ahead
 
 ENVS, LONG = 3, 40
 

@@ -12,7 +12,7 @@ from omegaconf import OmegaConf
 
 from vusfa.conf import FOLDER as CONF
 from vusfa.errors import ConfigError, VusfaError
-from vusfa.training import Training, make_training
+from vusfa.training import Trainer, make_trainer
 from vusfa.training.launch import compose
 
 SMALL = [
@@ -23,50 +23,48 @@ SMALL = [
     "collector.num_envs=6",
     "collector.rollout=4",
 ]
-HINDSIGHT = ["hindsight=replay", "hindsight.batch_size=16", "hindsight.updates=3"]
+HINDSIGHT = ["algorithm=hindsight", "hindsight.batch_size=16", "hindsight.updates=3"]
 
 
-def made(scene_file: Path, *overrides: str) -> Training:
+def made(scene_file: Path, *overrides: str) -> Trainer:
     cfg = compose(CONF, "train", [f"scenes=[{scene_file}]", *SMALL, *overrides])
     settings: Any = OmegaConf.to_container(cfg, resolve=True)
-    return make_training(settings)
+    return make_trainer(settings)
 
 
-def steps_taken(training: Training) -> int:
-    states = training.session.optimiser.state_dict()["state"]
+def steps_taken(trainer: Trainer) -> int:
+    states = trainer.optimizer.state_dict()["state"]
     return max(int(state["step"]) for state in states.values())
 
 
-def run(training: Training, updates: int) -> dict[str, torch.Tensor]:
-    with training.session.collecting(training.make_collector) as batches:
+def run(trainer: Trainer, updates: int) -> dict[str, torch.Tensor]:
+    with trainer.collecting() as batches:
         for _ in range(updates):
-            batch, terms = training.update(batches)
+            batch, terms = trainer.update(batches)
             assert batch.shape == (6, 4)
-            training.session.count(batch, terms, 1.0)
     return terms
 
 
 def test_without_hindsight_one_step_a_batch(scene_file: Path):
-    training = made(scene_file)
-    terms = run(training, 4)
-    assert training.hindsight is None
-    assert steps_taken(training) == 4
+    trainer = made(scene_file)
+    terms = run(trainer, 4)
+    assert trainer.algorithm.replay_steps == 0
+    assert steps_taken(trainer) == 4
     assert "loss_hindsight_critic" not in terms
 
 
 def test_hindsight_steps_as_often_as_asked(scene_file: Path):
-    training = made(scene_file, *HINDSIGHT)
-    terms = run(training, 4)
-    assert training.hindsight is not None
-    assert steps_taken(training) == 12
-    assert len(training.hindsight.replay) == 4 * 6 * 4
+    trainer = made(scene_file, *HINDSIGHT)
+    terms = run(trainer, 4)
+    assert trainer.algorithm.replay_steps == 2
+    assert steps_taken(trainer) == 12
+    assert len(trainer.algorithm.replay) == 4 * 6 * 4
     assert math.isfinite(terms["loss_hindsight_critic"].item())
 
 
-@pytest.mark.parametrize("updates", [0, 3])
-def test_entropy_and_rate_follow_the_frames(scene_file: Path, updates: int):
-    extra = [*HINDSIGHT, f"hindsight.updates={updates}"]
-    training = made(
+@pytest.mark.parametrize("extra", [[], HINDSIGHT], ids=["usf", "hindsight"])
+def test_entropy_and_rate_follow_the_frames(scene_file: Path, extra: list[str]):
+    trainer = made(
         scene_file,
         *extra,
         "optim.lr=0.01",
@@ -75,9 +73,9 @@ def test_entropy_and_rate_follow_the_frames(scene_file: Path, updates: int):
         "entropy.horizon=48",
         "entropy.end=0.0",
     )
-    run(training, 2)  # the second update begins at 24 of 48 frames
-    assert training.session.loss.entropy_coeff == pytest.approx(0.5)
-    assert float(training.session.optimiser.param_groups[0]["lr"]) == pytest.approx(0.005)
+    run(trainer, 2)  # the second update begins at 24 of 48 frames
+    assert trainer.algorithm.loss.entropy_coeff == pytest.approx(0.5)
+    assert float(trainer.optimizer.param_groups[0]["lr"]) == pytest.approx(0.005)
 
 
 @pytest.mark.parametrize(
@@ -86,6 +84,7 @@ def test_entropy_and_rate_follow_the_frames(scene_file: Path, updates: int):
         (["agent.memory=lstm"], "has no memory"),
         (["collector=multi_async"], "no fixed order"),
         (["hindsight.temperature=0"], "hindsight: "),
+        (["hindsight.updates=0"], "hindsight.updates is 0; give 1 or more, or algorithm=usf"),
     ],
 )
 def test_what_hindsight_cannot_do_is_said(scene_file: Path, overrides: list[str], words: str):
@@ -94,23 +93,23 @@ def test_what_hindsight_cannot_do_is_said(scene_file: Path, overrides: list[str]
 
 
 def test_an_autoencoders_phi_and_regressed_rewards(scene_file: Path):
-    training = made(scene_file, "preset=autoencoder")
-    agent = training.session.agent
+    trainer = made(scene_file, "preset=autoencoder")
+    agent = trainer.agent
     before = {name: value.clone() for name, value in agent.state_dict().items()}
-    terms = run(training, 3)
+    terms = run(trainer, 3)
     moved = {
         name.split(".")[0] for name, value in agent.state_dict().items() if not value.equal(before[name])
     }
     assert moved == {"fusion", "scene_layer", "successor", "reward", "policy"}
     assert terms["loss_reward"].item() > 0
     assert terms["loss_critic"].item() == 0
-    assert training.reconstructed is not None
-    assert 0 < training.reconstructed <= 1
+    assert trainer.algorithm.explained is not None
+    assert 0 < trainer.algorithm.explained <= 1
 
 
 def test_regression_of_the_reward_needs_reward_weights(scene_file: Path):
-    with pytest.raises(ConfigError, match=r"objective\.reward_coeff is 0\.5.*reward_weights"):
-        made(scene_file, "agent.model=gvf", "objective.reward_coeff=0.5")
+    with pytest.raises(ConfigError, match=r"objective\.terms\.reward is 0\.5.*reward_weights"):
+        made(scene_file, "agent.model=gvf", "objective.terms.reward=0.5")
 
 
 @pytest.mark.parametrize(
@@ -129,27 +128,25 @@ def test_where_answers_are_written_down(scene_file: Path, overrides: list[str], 
 def test_written_down_or_not_the_same_is_learned(scene_file: Path):
     weights = []
     for pairs in (True, False):
-        training = made(scene_file, "autocast=false", "collector.rollout=100")
+        trainer = made(scene_file, "autocast=false", "collector.rollout=100")
         if not pairs:
-            training.pairs = None
-        with training.session.collecting(training.make_collector) as batches:
+            trainer.pairs = None
+        with trainer.collecting() as batches:
             for _ in range(3):
-                batch, terms = training.update(batches)
-                training.session.count(batch, terms, 1.0)
-        weights.append(training.session.agent.state_dict())
+                trainer.update(batches)
+        weights.append(trainer.agent.state_dict())
     torch.testing.assert_close(*weights, rtol=1e-4, atol=1e-5)
 
 
 def test_weights_that_are_no_numbers_end_the_training(scene_file: Path, tmp_path: Path):
-    training = made(scene_file)
+    trainer = made(scene_file)
     path = tmp_path / "checkpoint.pt"
-    with training.session.collecting(training.make_collector) as batches:
-        batch, terms = training.update(batches)
-        training.session.count(batch, terms, 1.0)
-        before = training.session.save(path).read_bytes()
+    with trainer.collecting() as batches:
+        trainer.update(batches)
+        before = trainer.save(path).read_bytes()
         with torch.no_grad():
-            training.session.agent.fusion.linear.bias[1] = math.nan
-        for call in (training.session.metrics, lambda: training.session.save(path)):
+            trainer.agent.fusion.linear.bias[1] = math.nan
+        for call in (trainer.metrics, lambda: trainer.save(path)):
             with pytest.raises(VusfaError, match=r"24 frames.*fusion.linear.bias.*optim.lr"):
                 call()
     assert path.read_bytes() == before

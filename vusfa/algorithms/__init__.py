@@ -1,0 +1,38 @@
+"""Algorithms: the losses of a batch, of replay, and what follows a step; a registry of them.
+
+>>> sorted(ALGORITHMS)
+['autoencoder', 'hindsight', 'usf']
+"""
+
+from vusfa.algorithms.autoencoder import Autoencoder
+from vusfa.algorithms.base import Algorithm, AlgorithmSettings
+from vusfa.algorithms.hindsight import Hindsight
+from vusfa.algorithms.registry import (
+    ALGORITHMS,
+    LOSS_TERMS,
+    make_algorithm,
+    make_loss_terms,
+    register_algorithm,
+    register_loss_term,
+)
+from vusfa.algorithms.replay import HindsightReplay, HindsightSampler
+from vusfa.algorithms.schedule import annealed
+from vusfa.algorithms.usf import USF, make_usf_loss
+
+__all__ = [
+    "ALGORITHMS",
+    "LOSS_TERMS",
+    "USF",
+    "Algorithm",
+    "AlgorithmSettings",
+    "Autoencoder",
+    "Hindsight",
+    "HindsightReplay",
+    "HindsightSampler",
+    "annealed",
+    "make_algorithm",
+    "make_loss_terms",
+    "make_usf_loss",
+    "register_algorithm",
+    "register_loss_term",
+]

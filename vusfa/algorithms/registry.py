@@ -1,0 +1,108 @@
+"""Algorithms and additional loss terms by name.
+
+Both tables are filled by importing modules: nothing is imported because a setting or a checkpoint names it.
+"""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Callable, Iterable, Mapping
+from typing import Any, TypeVar
+
+from torchrl.objectives import LossModule
+
+from vusfa.algorithms.base import Algorithm
+from vusfa.errors import ConfigError
+from vusfa.modules import Agent
+from vusfa.scenes import SceneSet
+
+__all__ = [
+    "ALGORITHMS",
+    "LOSS_TERMS",
+    "make_algorithm",
+    "make_loss_terms",
+    "register_algorithm",
+    "register_loss_term",
+]
+
+AlgorithmClass = TypeVar("AlgorithmClass", bound=type[Algorithm])
+
+ALGORITHMS: dict[str, type[Algorithm]] = {}
+LOSS_TERMS: dict[str, Callable[[Agent, float], LossModule]] = {}
+
+
+def register_algorithm(name: str) -> Callable[[AlgorithmClass], AlgorithmClass]:
+    """Class decorator: ``algorithm=NAME`` trains with the class.
+
+    Args:
+        name: of the algorithm; an algorithm registered earlier under it is replaced.
+    """
+
+    def register(algorithm: AlgorithmClass) -> AlgorithmClass:
+        ALGORITHMS[name] = algorithm
+        return algorithm
+
+    return register
+
+
+def make_algorithm(name: str, agent: Agent, scenes: SceneSet, settings: Mapping[str, Any]) -> Algorithm:
+    """An algorithm by name.
+
+    Args:
+        name: that it is registered under.
+        agent, scenes, settings: of :class:`~vusfa.algorithms.Algorithm`.
+
+    Raises:
+        ConfigError: an unknown name, or settings that the algorithm does not fit.
+
+    >>> make_algorithm("uzf", None, None, {})
+    Traceback (most recent call last):
+    ...
+    vusfa.errors.ConfigError: algorithm 'uzf' is not registered; did you mean 'usf'?
+    """
+    if name not in ALGORITHMS:
+        raise ConfigError(f"algorithm {name!r} is not registered; {_near(name, ALGORITHMS)}")
+    return ALGORITHMS[name](agent, scenes, settings)
+
+
+def register_loss_term(name: str, make: Callable[[Agent, float], LossModule]) -> None:
+    """Adds a term to those that ``objective.terms`` may give a coefficient.
+
+    Args:
+        name: of the term.
+        make: called with the agent and the coefficient; the ``loss_*`` entries that the module returns hold
+            the coefficient. A :class:`~torchrl.objectives.LossModule` with these arguments will do.
+    """
+    LOSS_TERMS[name] = make
+
+
+def make_loss_terms(agent: Agent, coefficients: Mapping[str, float]) -> list[LossModule]:
+    """Registered terms with a coefficient other than 0.
+
+    Args:
+        agent: what learns.
+        coefficients: name of each term, and its coefficient.
+
+    Raises:
+        ConfigError: an unknown name, or an agent that the term does not fit.
+    """
+    terms = []
+    for name, coefficient in coefficients.items():
+        if name not in LOSS_TERMS:
+            raise ConfigError(
+                f"objective.terms.{name}: no such term is registered; {_near(name, LOSS_TERMS)}"
+            )
+        if not coefficient:
+            continue
+        try:
+            terms.append(LOSS_TERMS[name](agent, coefficient))
+        except ValueError as error:
+            raise ConfigError(f"objective.terms.{name} is {coefficient}: {error}; or give 0") from error
+    return terms
+
+
+def _near(name: str, names: Iterable[str]) -> str:
+    found = difflib.get_close_matches(name, list(names), n=1)
+    if found:
+        return f"did you mean {found[0]!r}?"
+    return f"there are {', '.join(names)}; import the module that registers it first"

@@ -1,0 +1,128 @@
+"""The paper's algorithm: advantage actor-critic with successor features and an information bottleneck."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModuleBase
+from torch import Tensor
+
+from vusfa.algorithms.base import Algorithm
+from vusfa.algorithms.registry import make_loss_terms, register_algorithm, register_loss_term
+from vusfa.algorithms.schedule import annealed
+from vusfa.errors import CheckpointError, ConfigError
+from vusfa.modules import Agent
+from vusfa.objectives import DualAscent, RewardRegressionLoss, USFEstimator, USFLoss
+from vusfa.scenes import SceneSet
+
+__all__ = ["USF", "make_usf_loss"]
+
+# arguments of USFEstimator and of DualAscent among the settings of objective; the others are USFLoss's
+_OF_TARGETS = (
+    "gamma",
+    "lmbda",
+    "n_steps",
+    "normalize_advantage",
+    "min_advantage_std",
+    "bootstrap_at_timeout",
+    "embedding_at",
+)
+_OF_ASCENT = {"bottleneck_step_size": "step_size", "bottleneck_maximum": "maximum"}
+# buffers of the loss that training moves; the others are settings
+_ADAPTED = ("bottleneck_coeff", "last_kl")
+
+register_loss_term(
+    "reward", lambda agent, coefficient: RewardRegressionLoss(agent.get_value_operator(), coefficient)
+)
+
+
+def make_usf_loss(
+    actor: ProbabilisticTensorDictSequential, critic: TensorDictModuleBase, **objective: Any
+) -> tuple[USFLoss, DualAscent | None]:
+    """The loss, with the estimator of its targets, and the multiplier's ascent if there is a bottleneck.
+
+    For a critic that writes a value alone, as GVF's, the loss is that of plain advantage actor-critic.
+
+    Args:
+        actor, critic: of one agent.
+        objective: settings of the group ``objective``, and ``entropy_coeff``.
+
+    Raises:
+        ConfigError: settings that make no sense.
+    """
+    ascent = {argument: objective.pop(name) for name, argument in _OF_ASCENT.items() if name in objective}
+    targets = {name: objective.pop(name) for name in _OF_TARGETS if name in objective}
+    try:
+        loss = USFLoss(actor, critic, distinct=True, **objective)
+        loss.make_value_estimator(USFEstimator(value_network=critic, **targets))
+        return loss, DualAscent(loss, **ascent) if loss.has_bottleneck else None
+    except ValueError as error:
+        raise ConfigError(f"objective: {error}") from error
+
+
+@register_algorithm("usf")
+class USF(Algorithm):
+    """:class:`~vusfa.objectives.USFLoss`, :class:`~vusfa.objectives.DualAscent` of the bottleneck's
+    multiplier, and the registered terms that ``objective.terms`` gives a coefficient.
+
+    Attributes:
+        loss: the paper's terms.
+        multiplier: ascent of the bottleneck's multiplier, or None.
+        terms: additional loss modules.
+    """
+
+    def __init__(self, agent: Agent, scenes: SceneSet, settings: Mapping[str, Any]) -> None:
+        super().__init__(agent, scenes, settings)
+        if agent.config["pretrained"] and settings["algorithm"]["name"] == "usf":
+            raise ConfigError(
+                f"agent.pretrained is {agent.config['pretrained']!r}, which algorithm=usf does not pretrain;"
+                f" give algorithm={agent.config['pretrained']}"
+            )
+        objective = dict(settings["objective"])
+        coefficients = objective.pop("terms", {})
+        self.loss, self.multiplier = make_usf_loss(
+            agent.get_policy_operator(out_keys=["action"]),
+            agent.get_value_operator(),
+            entropy_coeff=settings["entropy"]["start"],
+            **objective,
+        )
+        self.terms = make_loss_terms(agent, coefficients)
+        for module in (self.loss, *self.terms):
+            module.to(next(agent.parameters()).device)
+
+    def schedule(self, frames: int) -> None:
+        """Anneals the entropy's coefficient."""
+        self.loss.entropy_coeff = annealed(frames, **self.settings["entropy"])
+
+    def losses(self, batch: TensorDictBase) -> dict[str, Tensor]:
+        """The loss's terms and the additional ones."""
+        result = dict(self.loss(batch).items())
+        for term in self.terms:
+            result.update(term(batch).items())
+        return result
+
+    def after_step(self) -> None:
+        """A step of the multiplier."""
+        if self.multiplier is not None:
+            self.multiplier.step()
+
+    def state_dict(self) -> dict[str, Any]:
+        """The loss's buffers (coefficients, multiplier, last KL), without the networks."""
+        networks = ("actor_network", "critic_network")
+        buffers = self.loss.state_dict()
+        return {"loss": {name: value for name, value in buffers.items() if not name.startswith(networks)}}
+
+    @torch.no_grad()
+    def warm_start(self, state: Mapping[str, Any]) -> None:
+        """Takes the multiplier; coefficients are those of the settings.
+
+        Raises:
+            CheckpointError: the state is of another algorithm.
+        """
+        if "loss" not in state:
+            raise CheckpointError("of another algorithm; give the algorithm that it was trained with")
+        adapted = {name: state["loss"][name] for name in _ADAPTED if name in state["loss"]}
+        self.loss.load_state_dict(adapted, strict=False)

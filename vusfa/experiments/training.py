@@ -1,0 +1,106 @@
+"""Train an agent and evaluate it: what ``vusfa train`` and the recipes run."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+from vusfa.evaluation import Comparison, check_comparison, compare, print_summary
+from vusfa.files import check_folder
+from vusfa.training import (
+    EvaluationProgress,
+    ProgressLine,
+    StopOnSignal,
+    Trainer,
+    make_loggers,
+    make_trainer,
+    row_name,
+    set_threads,
+)
+
+__all__ = ["Trained", "train"]
+
+
+class Trained(NamedTuple):
+    """What :func:`train` leaves.
+
+    Attributes:
+        trainer: with the trained agent.
+        comparison: its evaluation, or None.
+        exit_code: 0, or 130 or 143 when a signal ended the training.
+    """
+
+    trainer: Trainer
+    comparison: Comparison | None
+    exit_code: int
+
+
+def train(settings: Mapping[str, Any], overrides: Sequence[str] = ()) -> Trained:
+    """Trains, and leaves metrics, a checkpoint and an evaluation in ``settings["folder"]``.
+
+    Args:
+        settings: as in vusfa/conf/train.yaml, resolved.
+        overrides: the command line that made them, kept in checkpoints.
+
+    Raises:
+        VusfaError: settings that make no sense, or a checkpoint that does not fit them.
+    """
+    plain: dict[str, Any] = _plain(settings)
+    set_threads(plain["threads"])
+    checkpoint = check_folder(plain["folder"], "folder") / "checkpoint.pt"
+    trainer = make_trainer(plain, overrides)
+    if trainer.note is not None:
+        print(trainer.note, file=sys.stderr)
+    evaluated = plain["evaluation"]["goals"]
+    if evaluated:
+        check_comparison(trainer.scenes, **_evaluation(trainer))
+    if plain["resume"]:
+        for change in trainer.resume(plain["resume"]):
+            print(f"resumed with {change}", file=sys.stderr)
+    frames = trainer.frames if plain["resume"] else None
+    with make_loggers(
+        folder=plain["folder"],
+        config=plain,
+        run_id=trainer.run_id,
+        resume_frames=frames,
+        **plain["logger"],
+    ) as loggers:
+        with StopOnSignal() as stop, ProgressLine(plain["total_frames"]) as progress:
+            trainer.run(checkpoint, loggers, stop, progress)
+        loggers.exit_code = stop.exit_code
+        comparison = None
+        if evaluated and not stop.received:
+            comparison = _evaluate(trainer)
+            comparison.save(checkpoint.with_name("evaluation"))
+            loggers.log_table("evaluation", comparison.rows, trainer.frames)
+            print_summary(comparison.rows, note=comparison.note)
+    return Trained(trainer, comparison, stop.exit_code)
+
+
+def _evaluation(trainer: Trainer) -> dict[str, Any]:
+    """Goals and numbers of the evaluation."""
+    chosen = dict(trainer.settings["evaluation"])
+    return {**chosen, "goals": trainer.goals if chosen["goals"] == "trained" else chosen["goals"]}
+
+
+def _evaluate(trainer: Trainer) -> Comparison:
+    with EvaluationProgress() as progress:
+        return compare(
+            {row_name(trainer.settings): trainer.actor},
+            trainer.scenes,
+            trained=trainer.goals,
+            progress=progress,
+            history=trainer.agent.config["history"],
+            observe=trainer.observation,
+            **_evaluation(trainer),
+        )
+
+
+def _plain(value: Any) -> Any:
+    """Mappings and sequences, such as OmegaConf's, as dicts and lists."""
+    if isinstance(value, Mapping):
+        return {key: _plain(item) for key, item in value.items()}
+    if isinstance(value, Sequence) and not isinstance(value, str):
+        return [_plain(item) for item in value]
+    return value

@@ -1,0 +1,81 @@
+"""The optimizer: by name, and one step of it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from vusfa.errors import ConfigError
+from vusfa.objectives import TFRMSprop
+
+__all__ = ["OPTIMIZERS", "descend", "make_optimizer", "total_loss"]
+
+OPTIMIZERS = ("adam", "rmsprop", "tf_rmsprop")
+
+
+def total_loss(terms: Mapping[str, Tensor]) -> Tensor:
+    """Sum of the entries whose name begins with ``loss_``; each holds its coefficient.
+
+    >>> half, quarter = torch.tensor(0.5), torch.tensor(0.25)
+    >>> total_loss({"loss_critic": half, "loss_entropy": quarter, "kl": half})
+    tensor(0.7500)
+    """
+    return torch.stack([value for name, value in terms.items() if name.startswith("loss_")]).sum()
+
+
+def descend(
+    optimizer: torch.optim.Optimizer, total: Tensor, lr: float, max_grad_norm: float | None
+) -> Tensor:
+    """One step of the optimizer down the gradient of ``total``.
+
+    Args:
+        optimizer: holds the parameters.
+        total: scalar.
+        lr: learning rate of this step.
+        max_grad_norm: all gradients as one vector are clipped to this norm; None leaves them, as does
+            :class:`~vusfa.objectives.TFRMSprop`, which clips every tensor on its own.
+
+    Returns:
+        the gradient's norm before clipping, a scalar.
+    """
+    params = [param for group in optimizer.param_groups for param in group["params"]]
+    for group in optimizer.param_groups:
+        group["lr"] = lr
+    optimizer.zero_grad()
+    total.backward()
+    clips_itself = isinstance(optimizer, TFRMSprop)
+    limit = float("inf") if clips_itself or max_grad_norm is None else max_grad_norm
+    norm = nn.utils.clip_grad_norm_(params, limit)
+    optimizer.step()
+    return norm
+
+
+def make_optimizer(
+    params: Iterable[nn.Parameter], kind: str, lr: float, max_grad_norm: float | None = None, **options: Any
+) -> torch.optim.Optimizer:
+    """An optimizer by name.
+
+    Args:
+        params: of the agent.
+        kind: ``"adam"``, ``"rmsprop"`` (torch's) or ``"tf_rmsprop"`` (:class:`~vusfa.objectives.TFRMSprop`).
+        lr: learning rate at the start.
+        max_grad_norm: only ``tf_rmsprop`` clips by itself, every tensor on its own; the others leave it to
+            the caller, who clips all tensors as one.
+        options: further arguments of the optimizer.
+
+    Raises:
+        ConfigError: unknown kind or argument.
+    """
+    if kind not in OPTIMIZERS:
+        raise ConfigError(f"optim.kind is {kind!r}; it must be one of {', '.join(OPTIMIZERS)}")
+    try:
+        if kind == "tf_rmsprop":
+            return TFRMSprop(params, lr=lr, max_grad_norm=max_grad_norm, **options)
+        return {"adam": torch.optim.Adam, "rmsprop": torch.optim.RMSprop}[kind](params, lr=lr, **options)
+    except (TypeError, ValueError) as error:
+        raise ConfigError(
+            f"optim.kind={kind} does not take optim.lr={lr}, optim.options={options}: {error}"
+        ) from error

@@ -1,0 +1,313 @@
+"""Trainer: the state of a training, and its loop.
+
+Each update is: collect, losses, optimizer step, further steps from replay, what follows a step. Which losses
+these are is the business of an :class:`~vusfa.algorithms.Algorithm`; none is named here.
+"""
+
+from __future__ import annotations
+
+import secrets
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, ExitStack, contextmanager
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
+from torchrl.collectors import BaseCollector, Collector
+
+from vusfa.algorithms import Algorithm, annealed
+from vusfa.envs import SceneObservation
+from vusfa.errors import CheckpointError, VusfaError
+from vusfa.modules import ActingPolicy, Agent, StateGoalPairs, frozen
+from vusfa.scenes import SceneSet
+from vusfa.training.checkpoint import (
+    check_fits,
+    differences,
+    load_checkpoint,
+    load_optimizer,
+    load_weights,
+    save_checkpoint,
+    scene_sources,
+)
+from vusfa.training.collectors import collector_state, load_collector_state, opened
+from vusfa.training.loggers import Logger
+from vusfa.training.metrics import EpisodeMeter, MeanMeter
+from vusfa.training.optimization import descend, total_loss
+from vusfa.training.progress import ProgressLine
+from vusfa.training.random_state import random_state, restore_random_state
+from vusfa.training.signals import StopOnSignal
+
+__all__ = ["Trainer"]
+
+
+class Trainer:
+    """Everything that changes while an agent learns, and one update after the other.
+
+    :func:`~vusfa.training.make_trainer` makes one from settings.
+
+    Args:
+        scenes: the world.
+        goals: (G,) global ids of the goals trained on.
+        agent: what learns.
+        algorithm: its losses.
+        optimizer: of ``algorithm.parameters()``.
+        make_collector: called with the policy that collects.
+        settings: all settings, plain.
+        overrides: the command line that made them; kept in checkpoints.
+        observation: transform between world and agent, or None.
+        pairs: everything that the collector may ask the policy, if its answers are to be tabulated before
+            each batch; None to compute them step by step.
+        note: what the algorithm's preparation has to say, or None.
+
+    Attributes:
+        actor: the policy; writes ``action``.
+        frames: frames trained on.
+        updates: updates made.
+        seconds: time spent in updates, in this run and those that it continues.
+        episodes: how the episodes since the last line of the log ended.
+        terms: means of the loss's terms since then.
+        run_id: the same for all loggers and for all resumptions.
+    """
+
+    def __init__(
+        self,
+        scenes: SceneSet,
+        goals: Tensor,
+        agent: Agent,
+        algorithm: Algorithm,
+        optimizer: torch.optim.Optimizer,
+        make_collector: Callable[[TensorDictModuleBase], BaseCollector],
+        settings: Mapping[str, Any],
+        overrides: Sequence[str] = (),
+        observation: SceneObservation | None = None,
+        pairs: StateGoalPairs | None = None,
+        note: str | None = None,
+    ) -> None:
+        self.scenes, self.goals, self.agent = scenes, goals, agent
+        self.algorithm, self.optimizer = algorithm, optimizer
+        self.settings, self.overrides = settings, overrides
+        self.observation, self.pairs, self.note = observation, pairs, note
+        self.actor = agent.get_policy_operator(out_keys=["action"])
+        self.acting = None if agent.memory is not None else ActingPolicy(agent)
+        self._make_collector = partial(make_collector, self.actor if self.acting is None else self.acting)
+        self.frames, self.updates, self.seconds = 0, 0, 0.0
+        self.run_id = secrets.token_hex(4)
+        self.episodes, self.terms = EpisodeMeter(scenes, goals), MeanMeter()
+        self._collector: BaseCollector | None = None
+        self._waiting: Mapping[str, Any] | None = None  # of a checkpoint: what a collector must be there for
+
+    @contextmanager
+    def collecting(self) -> Iterator[Iterator[TensorDictBase]]:
+        """Batches of a new collector, from where a resumed checkpoint stood; its processes end with the
+        context."""
+        with opened(self._make_collector) as collector:
+            self._collector = collector
+            try:
+                if self._waiting is not None:
+                    load_collector_state(collector, self._waiting["collector"])
+                    restore_random_state(self._waiting["rng"])  # last: what came before has drawn
+                    self._waiting = None
+                yield iter(collector)
+            finally:
+                self._collector = None
+
+    def collect(self, batches: Iterator[TensorDictBase]) -> TensorDictBase:
+        """The collector's next batch, without an update."""
+        with self._encoded_once():
+            return self._next(batches)
+
+    def update(self, batches: Iterator[TensorDictBase]) -> tuple[TensorDictBase, dict[str, Tensor]]:
+        """One update, counted.
+
+        Args:
+            batches: those of :meth:`collecting`.
+
+        Returns:
+            the batch, and the numbers to log: the losses' terms and the gradient's norm.
+        """
+        began, optim = time.monotonic(), self.settings["optim"]
+        step = partial(
+            descend,
+            self.optimizer,
+            lr=annealed(self.frames, optim["lr"], optim["horizon"]),
+            max_grad_norm=optim["max_grad_norm"],
+        )
+        self.algorithm.schedule(self.frames)
+        with self._encoded_once():
+            batch = self._next(batches)
+            with self._precision():  # another one: autocast keeps weights that it converted without gradients
+                terms = dict(self.algorithm.losses(batch))
+            total = total_loss(terms)
+        norm = step(total)
+        for _ in range(self.algorithm.replay_steps):
+            with ExitStack() as stack:
+                with self._precision():
+                    stack.enter_context(frozen(self.agent, grad=True))
+                with self._precision():
+                    more = self.algorithm.replay_losses()
+                total = total_loss(more)
+            step(total)
+            terms.update(more)
+        self.algorithm.after_step()
+        terms["grad_norm"] = norm
+        self.frames += batch.numel()
+        self.updates += 1
+        self.episodes.update(batch)
+        self.terms.update(terms)
+        self.seconds += time.monotonic() - began
+        return batch, terms
+
+    def run(self, checkpoint: Path, loggers: Logger, stop: StopOnSignal, progress: ProgressLine) -> None:
+        """Updates until ``total_frames`` or a signal, with lines of the log and checkpoints.
+
+        Args:
+            checkpoint: file, written at intervals and at the end.
+            loggers: get metrics and checkpoints.
+            stop: looked at after each update.
+            progress: the live line.
+        """
+        total, log_every = self.settings["total_frames"], self.settings["log_every"]
+        checkpoint_every = self.settings["checkpoint_every"]
+        with self.collecting() as batches:
+            while self.frames < total and not stop.received:
+                before = self.frames
+                self.update(batches)
+                progress.update(self.frames)
+                ended = self.frames >= total  # a short training is logged, too
+                if ended or before // log_every < self.frames // log_every:
+                    metrics = self.metrics()
+                    loggers.log_metrics(metrics, self.frames)
+                    progress.rates(metrics["success"], metrics["length_ratio"])
+                if before // checkpoint_every < self.frames // checkpoint_every:
+                    loggers.log_checkpoint(self.save(checkpoint), self.frames)
+            loggers.log_checkpoint(self.save(checkpoint), self.frames)
+
+    def metrics(self) -> dict[str, float]:
+        """A line of the log: what the meters hold, which begin anew, and how far the training has come.
+
+        Raises:
+            VusfaError: a weight is not finite.
+        """
+        self._check_weights()
+        lr = self.optimizer.param_groups[0]["lr"]
+        head = {"updates": float(self.updates), "seconds": self.seconds, "lr": lr}
+        return head | self.episodes.flush() | self.terms.flush()
+
+    def save(self, path: str | Path) -> Path:
+        """Writes a checkpoint, atomically, within :meth:`collecting`; see :mod:`vusfa.training.checkpoint`.
+
+        Raises:
+            VusfaError: a weight is not finite; an earlier checkpoint stays as it is.
+        """
+        self._check_weights()
+        if self._collector is None:
+            raise RuntimeError(
+                "a trainer is saved within collecting(): the environments' state belongs to it"
+            )
+        return save_checkpoint(
+            path,
+            {
+                "frames": self.frames,
+                "updates": self.updates,
+                "seconds": self.seconds,
+                "run_id": self.run_id,
+                "scenes": {
+                    "sources": scene_sources(self.settings["scenes"]),
+                    "names": list(self.scenes.names),
+                    "fingerprint": self.scenes.fingerprint,
+                },
+                "goals": self.goals.cpu(),
+                "config": self.settings,
+                "overrides": list(self.overrides),
+                "agent_config": self.agent.config,
+                "agent": self.agent.state_dict(),
+                "algorithm": self.algorithm.state_dict(),
+                "optimizer": self.optimizer.state_dict(),
+                "collector": collector_state(self._collector),
+                "meter": {"episodes": self.episodes.state_dict(), "terms": self.terms.state_dict()},
+                "rng": random_state(),
+            },
+        )
+
+    def load_weights(self, state: Mapping[str, Any], path: str | Path = "the checkpoint") -> None:
+        """Takes a checkpoint's weights and what belongs to them, such as a multiplier, and nothing else.
+
+        Args:
+            state: content of the checkpoint.
+            path: for messages.
+
+        Raises:
+            CheckpointError: the weights are of another model.
+        """
+        load_weights(self.agent, state, path)
+        self.algorithm.warm_start(state["algorithm"])
+
+    def resume(self, path: str | Path) -> list[str]:
+        """Continues from a checkpoint; to be called before :meth:`collecting`.
+
+        With a single collector what follows is what would have followed, number for number. Coefficients and
+        the optimizer's numbers are those of the settings now; what the training itself has moved is restored.
+
+        Returns:
+            settings that differ from the checkpoint's, one line each.
+
+        Raises:
+            CheckpointError: the file is damaged, or of another model, other scenes, goals or optimizer.
+        """
+        state = load_checkpoint(path, next(self.agent.parameters()).device)
+        check_fits(path, state, self.scenes, self.goals, self.agent)
+        load_weights(self.agent, state, path)
+        load_optimizer(self.optimizer, state, path)
+        try:
+            self.algorithm.load_state_dict(state["algorithm"])
+        except CheckpointError as error:
+            raise CheckpointError(f"{path}: {error}") from error
+        self.episodes.load_state_dict(state["meter"]["episodes"])
+        self.terms.load_state_dict(state["meter"]["terms"])
+        for name in ("frames", "updates", "seconds", "run_id"):
+            setattr(self, name, state[name])
+        self._waiting = state
+        return differences(state["config"], self.settings)
+
+    def _precision(self) -> AbstractContextManager:
+        device = next(self.agent.parameters()).device.type
+        return torch.autocast(device, torch.bfloat16, enabled=self.settings["autocast"])
+
+    def _next(self, batches: Iterator[TensorDictBase]) -> TensorDictBase:
+        with self._precision(), ExitStack() as stack:
+            if self.acting is not None and self.pairs is not None:
+                stack.enter_context(self.acting.tabulated(self.pairs))
+            return next(batches)
+
+    @contextmanager
+    def _encoded_once(self) -> Iterator[None]:
+        """The whole world is encoded on the way in; collecting and the losses look it up.
+
+        Where a batch has less than half as many frames as the world has states, encoding the batch's states
+        as they come is cheaper; so it is with a collector's workers.
+        """
+        collector = self._collector
+        frames = collector.requested_frames_per_batch if isinstance(collector, Collector) else 0
+        with ExitStack() as stack:
+            if 2 * frames >= self.scenes.num_states:
+                goals = None if self.algorithm.relabels_goals else self.goals
+                with self._precision():
+                    stack.enter_context(frozen(self.agent, grad=True, goals=goals))
+            yield
+
+    @torch.no_grad()
+    def _check_weights(self) -> None:
+        # one number for all weights: a short batch is logged at every update
+        if torch.nn.utils.get_total_norm(self.algorithm.parameters()).isfinite():
+            return
+        wrong = [name for name, param in self.agent.named_parameters() if not param.isfinite().all()]
+        if wrong:
+            raise VusfaError(
+                f"after {self.frames:,} frames the weights {', '.join(wrong)} are not finite any more; choose"
+                " a smaller optim.lr or optim.max_grad_norm, and resume an earlier checkpoint or begin anew"
+            )
