@@ -1,5 +1,6 @@
 """What is learned: losses, returns, and the optimiser and multiplier of the paper's code."""
 
+from vusfa.objectives.a3c import A3CRMSprop
 from vusfa.objectives.functional import (
     dual_ascent,
     explained_variance,
@@ -18,6 +19,7 @@ from vusfa.objectives.reward import RewardRegressionLoss, reward_regression_loss
 from vusfa.objectives.usf import USFLoss
 
 __all__ = [
+    "A3CRMSprop",
     "DualAscent",
     "HindsightLoss",
     "RewardRegressionLoss",
