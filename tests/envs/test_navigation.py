@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import inspect
 import pickle
 from collections.abc import Callable
 from typing import Any
@@ -388,3 +389,24 @@ def test_on_a_gpu(scenes: SceneSet) -> None:
 def test_bad_arguments_name_themselves(scenes: SceneSet, options: dict[str, Any], message: str) -> None:
     with pytest.raises(ConfigError, match=message):
         TargetNavEnv(scenes, "all", **options)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ((["bathroom"],), r"scenes is \['bathroom'\]; give a SceneSet"),
+        ((SceneSet.bundled(["bathroom"]), "all", 4), r"batch_size is 4; give a list, \[4\]"),
+    ],
+)
+def test_wrong_types_of_arguments_name_themselves(arguments: tuple[Any, ...], message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        TargetNavEnv(*arguments)
+
+
+def test_signature_and_repr_show_the_arguments(scenes: SceneSet) -> None:
+    parameters = inspect.signature(TargetNavEnv).parameters
+    assert list(parameters)[:4] == ["scenes", "goals", "batch_size", "history"]
+    assert parameters["max_steps"].default == 500
+    env = TargetNavEnv(scenes, "all", [3])
+    assert repr(env).startswith(f"TargetNavEnv({scenes!r}, ")
+    assert "batch_size=[3], history=4, max_steps=500, goal_sampling='fixed', device='cpu')" in repr(env)

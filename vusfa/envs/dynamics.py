@@ -14,7 +14,25 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-__all__ = ["Rewards", "Transition", "push_frame", "start_history", "step"]
+__all__ = [
+    "GOAL_REWARD",
+    "HISTORY",
+    "MAX_STEPS",
+    "STEP_REWARD",
+    "Rewards",
+    "Transition",
+    "push_frame",
+    "start_history",
+    "step",
+]
+
+# The task's defaults.
+#: frames that an agent sees, the present one included
+HISTORY = 4
+#: steps after which an episode is truncated
+MAX_STEPS = 500
+#: reward of reaching the goal, and of any other step
+GOAL_REWARD, STEP_REWARD = 1.0, -0.01
 
 
 class Rewards(NamedTuple):
@@ -30,7 +48,9 @@ class Rewards(NamedTuple):
     collision: Tensor | None
 
     @classmethod
-    def of(cls, goal: float = 1.0, step: float = -0.01, collision: float | None = None) -> Rewards:
+    def of(
+        cls, goal: float = GOAL_REWARD, step: float = STEP_REWARD, collision: float | None = None
+    ) -> Rewards:
         """Build it from numbers. Without a ``collision`` reward a collision earns what any step earns."""
         as_tensor = [
             None if x is None else torch.tensor(x, dtype=torch.float32) for x in (goal, step, collision)

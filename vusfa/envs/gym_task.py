@@ -30,9 +30,9 @@ class _Rows(TargetNavEnv):
     def __init__(self, scenes: Scenes | None, num_rows: int, **options: Any) -> None:
         if not isinstance(scenes, SceneSet):
             scenes = SceneSet.bundled() if scenes is None else SceneSet.open(scenes)
-        self.__dict__["rngs"] = [None] * num_rows
-        self.__dict__["drawing"] = np.zeros(num_rows, dtype=np.bool_)
         super().__init__(scenes, batch_size=[num_rows], **options)
+        self.rngs: list[Any] = [None] * num_rows
+        self.drawing = np.zeros(num_rows, dtype=np.bool_)
 
     def _draw(self, *count: int) -> Tensor:
         draws = np.zeros((self.numel(), *count), dtype=np.int64)

@@ -1,33 +1,32 @@
 """The task as a TorchRL environment: many agents, several scenes, one tensor operation each.
 
-The environment keeps no state of its own: where each agent is, where it wants to go and how long it has been
-walking stands in the tensordict. So a rollout can be taken up anywhere, and a step is a pure function
-(:mod:`vusfa.envs.dynamics`). What travels is integers: 4 of them describe what would be 4 x 2048 features.
+The environment keeps no state of its own: each agent's place, goal and number of steps are in the tensordict.
+So a rollout can be resumed anywhere, and a step is a pure function (:mod:`vusfa.envs.dynamics`). Data are
+integers: 4 of them stand for 4 x 2048 features.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from typing import Any, ClassVar
+from collections.abc import Sequence
+from typing import Any
 
-import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
-from torchrl.envs import EnvBase
 
 from vusfa.envs import dynamics
 from vusfa.envs.goals import GoalSpec, resolve_goals
-from vusfa.envs.rendering import draw_panels
+from vusfa.envs.scene_env import SceneEnv
 from vusfa.envs.starts import DRAW_LIMIT, GoalTable, draw_goals, draw_starts, paths_from
-from vusfa.envs.world import env_specs, make_world, map_tensors
+from vusfa.envs.world import make_world
 from vusfa.errors import ConfigError, GoalError
 from vusfa.scenes import SceneSet
+from vusfa.torchrl_private import unchecked_tensordict
 
 __all__ = ["TargetNavEnv"]
 
 
-class TargetNavEnv(EnvBase):
+class TargetNavEnv(SceneEnv):
     """Walk to the place where a picture was taken, from pictures alone.
 
     Args:
@@ -84,33 +83,26 @@ class TargetNavEnv(EnvBase):
     ([[True], [False]], [[1.0], [-0.009...]])
     """
 
-    batch_locked: ClassVar[bool] = True
-    metadata: ClassVar[dict[str, Any]] = {"render_modes": ["rgb_array"], "render_fps": 4}
-    # reset(tensordict, set_state=True) takes up the episodes that the tensordict describes
-    _supports_set_state = True
-
     def __init__(
         self,
         scenes: SceneSet,
         goals: GoalSpec = "paper",
         batch_size: Sequence[int] = (),
         *,
-        history: int = 4,
-        max_steps: int = 500,
+        history: int = dynamics.HISTORY,
+        max_steps: int = dynamics.MAX_STEPS,
         goal_sampling: str = "fixed",
         first_goal: int = 0,
-        goal_reward: float = 1.0,
-        step_reward: float = -0.01,
+        goal_reward: float = dynamics.GOAL_REWARD,
+        step_reward: float = dynamics.STEP_REWARD,
         collision_reward: float | None = None,
         seed: int | None = None,
         device: torch.device | str | None = None,
     ) -> None:
-        super().__init__(device=torch.device("cpu"), batch_size=torch.Size(batch_size))
         _check_arguments(
             history=history, max_steps=max_steps, goal_sampling=goal_sampling, first_goal=first_goal
         )
-        self.scenes = scenes.to("cpu")
-        self.history = history
+        super().__init__(scenes, batch_size, history, seed)
         self.max_steps = max_steps
         self.goal_sampling = goal_sampling
         self.goals = resolve_goals(self.scenes, goals)
@@ -120,20 +112,16 @@ class TargetNavEnv(EnvBase):
             rows = (torch.arange(self.numel()) + first_goal).reshape(self.batch_size)
         self._world = make_world(self.scenes, self.goals, rewards, rows)
         self._make_specs()
-        self._generator = torch.Generator()
-        self._seed: int | None = None
-        self._set_seed(seed)
-        self._shown: tuple[Tensor, Tensor] | None = None
         if device is not None:
             self.to(device)
 
-    def _make_specs(self) -> None:
-        specs = env_specs(self.scenes, self.batch_size, self.history)
-        self.state_spec = specs.state
-        self.observation_spec = specs.observation
-        self.action_spec = specs.action
-        self.reward_spec = specs.reward
-        self.full_done_spec = specs.done
+    def __repr__(self) -> str:
+        options = ("history", "max_steps", "goal_sampling")
+        values = ", ".join(f"{name}={getattr(self, name)!r}" for name in options)
+        return (
+            f"{type(self).__name__}({self.scenes!r}, {len(self.goals)} goals,"
+            f" batch_size={list(self.batch_size)}, {values}, device={str(self.device)!r})"
+        )
 
     # -- the two halves of an episode ------------------------------------------------------------------------
 
@@ -197,44 +185,24 @@ class TargetNavEnv(EnvBase):
         return torch.zeros((*self.batch_size, 1), dtype=dtype, device=self.device)
 
     def _wrap(self, entries: dict[str, Tensor]) -> TensorDict:
-        # What TensorDict(entries) would check of each entry at each step holds by construction.
-        return TensorDict._new_unsafe(source=entries, batch_size=self.batch_size, device=self.device)
+        return unchecked_tensordict(entries, self.batch_size, self.device)
 
-    def _step_and_maybe_reset(self, tensordict: TensorDictBase) -> tuple[TensorDictBase, TensorDictBase]:
-        """One step, and new episodes where one ended.
-
-        The same as :class:`EnvBase` does, draw for draw, without the detour through :meth:`reset`, which
-        checks and merges what is known here; with many rows some episode ends at almost every step. Entries
-        that the environment does not know, such as a policy's outputs, stay as they are.
-        """
-        if tensordict.device != self.device:
-            tensordict = tensordict.to(self.device)
-        if "next" in tensordict or "_step" in tensordict:
-            return super()._step_and_maybe_reset(tensordict)
-        following = self._step(tensordict)
-        tensordict.set("next", following)
-        root = self._step_mdp(tensordict)
-        done = following.get("done")
-        if done.any():
-            start, goals = self._begin()
-            path = paths_from(self._world.distance, goals, start)
-            mask = done.squeeze(-1)
-            state_id = torch.where(done, start.unsqueeze(-1), following.get("state_id"))
-            goal_id = torch.where(mask, goals.goal, following.get("goal_id"))
-            entries = {
-                "state_id": state_id,
-                "goal_id": goal_id,
-                "scene_id": torch.where(mask, goals.scene, following.get("scene_id")),
-                "shortest_path": torch.where(done, path.unsqueeze(-1), following.get("shortest_path")),
-                "step_count": following.get("step_count").masked_fill(done, 0),
-                "collided": following.get("collided").masked_fill(done, False),
-            }
-            for key in ("done", "terminated", "truncated"):
-                entries[key] = torch.zeros_like(done)
-            for key, value in entries.items():
-                root._set_str(key, value, validated=True, inplace=False, non_blocking=False)
-            self._show(state_id, goal_id)
-        return tensordict, root
+    def _renew(self, following: TensorDictBase, done: Tensor) -> dict[str, Tensor]:
+        start, goals = self._begin()
+        path = paths_from(self._world.distance, goals, start)
+        mask = done.squeeze(-1)
+        entries = {
+            "state_id": torch.where(done, start.unsqueeze(-1), following.get("state_id")),
+            "goal_id": torch.where(mask, goals.goal, following.get("goal_id")),
+            "scene_id": torch.where(mask, goals.scene, following.get("scene_id")),
+            "shortest_path": torch.where(done, path.unsqueeze(-1), following.get("shortest_path")),
+            "step_count": following.get("step_count").masked_fill(done, 0),
+            "collided": following.get("collided").masked_fill(done, False),
+        }
+        for key in ("done", "terminated", "truncated"):
+            entries[key] = torch.zeros_like(done)
+        self._show(entries["state_id"], entries["goal_id"])
+        return entries
 
     # -- putting agents where one wants them -----------------------------------------------------------------
 
@@ -259,8 +227,8 @@ class TargetNavEnv(EnvBase):
             torch.as_tensor(x, dtype=torch.int64, device=self.device).expand(self.batch_size)
             for x in (state, goal)
         )
-        wanted = {"state_id": dynamics.start_history(state, self.history), "goal_id": goal.clone()}
-        return self.reset(TensorDict(wanted, batch_size=self.batch_size, device=self.device), set_state=True)
+        entries = {"state_id": dynamics.start_history(state, self.history), "goal_id": goal.clone()}
+        return self.reset(TensorDict(entries, batch_size=self.batch_size, device=self.device), set_state=True)
 
     def _resume(self, tensordict: TensorDictBase) -> dict[str, Tensor]:
         """Take up the episodes that a tensordict describes; what it leaves out is that of a fresh episode."""
@@ -289,108 +257,6 @@ class TargetNavEnv(EnvBase):
             if key in tensordict:
                 entries[key] = tensordict.get(key).clone()
         return entries
-
-    # -- randomness ------------------------------------------------------------------------------------------
-
-    def _set_seed(self, seed: int | None) -> None:
-        """Start the generator anew; None starts it somewhere else each time."""
-        self._seed = seed
-        if seed is None:
-            self._generator.seed()
-        else:
-            self._generator.manual_seed(seed)
-
-    @property
-    def generator(self) -> torch.Generator:
-        """What every draw comes from."""
-        return self._generator
-
-    def get_rng_state(self) -> Tensor:
-        """State of the generator, a byte tensor on the CPU."""
-        return self._generator.get_state()
-
-    def set_rng_state(self, state: Tensor) -> None:
-        """Go on drawing from where :meth:`get_rng_state` was called, on a device of the same kind."""
-        self._generator.set_state(state.cpu())
-
-    def get_extra_state(self) -> Tensor:
-        """What :meth:`state_dict` holds: the generator's state."""
-        return self.get_rng_state()
-
-    def set_extra_state(self, state: Tensor) -> None:
-        """Called by :meth:`load_state_dict`."""
-        self.set_rng_state(state)
-
-    def load_state_dict(self, state_dict: Any, strict: bool = True, assign: bool = False) -> Any:
-        """Restore what :meth:`state_dict` gave; an empty one, as TorchRL's collectors keep, does nothing."""
-        return super().load_state_dict(state_dict, strict=strict and bool(state_dict), assign=assign)
-
-    # -- devices ---------------------------------------------------------------------------------------------
-
-    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> TargetNavEnv:
-        """What every move of a module comes down to; the tables move along, and the generator begins anew."""
-        super()._apply(fn, recurse)
-        self._world = map_tensors(fn, self._world)
-        device = self._world.successor.device
-        if device != self._generator.device:
-            # A generator's state means nothing on another kind of device: draws begin again from the seed.
-            self._generator = torch.Generator(device)
-            self._set_seed(self._seed)
-        return self
-
-    # -- pictures --------------------------------------------------------------------------------------------
-
-    def _show(self, state_id: Tensor, goal_id: Tensor, mask: Tensor | None = None) -> None:
-        """Remember what :meth:`render` shows without being told."""
-        shown = self._shown
-        if mask is not None and shown is not None:
-            mask = mask.reshape(self.batch_size)
-            state_id = torch.where(mask.unsqueeze(-1), state_id, shown[0])
-            goal_id = torch.where(mask, goal_id, shown[1])
-        self.__dict__["_shown"] = (state_id, goal_id)
-
-    def render(
-        self,
-        tensordict: TensorDictBase | None = None,
-        row: int | tuple[int, ...] = 0,
-        panels: Sequence[str] | None = None,
-    ) -> np.ndarray:
-        """Show one agent, as a picture.
-
-        Args:
-            tensordict: where the agents are (``state_id`` and ``goal_id``, of the environment's batch size);
-                what the environment produced last when not given.
-            row: which agent, its index in the batch (in row-major order when a number).
-            panels: what to show from left to right: "view" what the agent sees, "goal" the goal's picture,
-                "map" the scene from above. By default the view, or the map where a scene has no pictures.
-
-        Returns:
-            (h, w, 3) uint8.
-
-        Raises:
-            ConfigError: nothing to show yet, no such row, or no such panel.
-            SceneError: the scene has no pictures.
-
-        >>> from vusfa.scenes import SceneSet
-        >>> env = TargetNavEnv(SceneSet.bundled(["bathroom"]), batch_size=[3])
-        >>> data = env.reset()
-        >>> env.render().shape, env.render(data, row=2, panels=("view", "map")).shape
-        ((150, 200, 3), (150, 358, 3))
-        """
-        if tensordict is not None:
-            state_id, goal_id = tensordict.get("state_id"), tensordict.get("goal_id")
-        elif self._shown is not None:
-            state_id, goal_id = self._shown
-        else:
-            raise ConfigError("there is nothing to render yet; call reset() first, or pass a tensordict")
-        try:
-            index = (
-                row if isinstance(row, tuple) else np.unravel_index(row, self.batch_size or (1,))[: self.ndim]
-            )
-            trail, goal = state_id[index].tolist(), int(goal_id[index])
-        except (IndexError, ValueError) as error:
-            raise ConfigError(f"there is no row {row}; the batch is {tuple(self.batch_size)}") from error
-        return draw_panels(self.scenes, trail, goal, panels)
 
 
 def _check_arguments(*, history: int, max_steps: int, goal_sampling: str, first_goal: int) -> None:

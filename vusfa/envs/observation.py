@@ -123,15 +123,15 @@ class SceneObservation(ObservationTransform):
         self.crop = index
         self.crops = crops
         # Not a buffer: it is built when it is needed, and neither saved nor pickled.
-        self.__dict__["_table"] = None
+        self._table: Tensor | None = None
 
     def _apply_transform(self, obs: Tensor) -> Tensor:
-        table = self.__dict__["_table"]
+        table = self._table
         if table is None or table.device != obs.device:
             table = observation_table(self.scenes, self.kind, self.size).to(obs.device)
-            table = self.__dict__["_table"] = (
-                table if self.crop is None else table[:, self.crop : self.crop + 1].contiguous()
-            )
+            if self.crop is not None:
+                table = table[:, self.crop : self.crop + 1].contiguous()
+            self._table = table
         entry = obs.reshape(-1)
         if self.crop is None:
             drawn = torch.randint(self.crops, entry.shape, generator=self._generator(), device=obs.device)

@@ -1,0 +1,166 @@
+"""What environments over scenes have in common: arguments that show, a generator, a device, pictures."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable, Sequence
+from typing import Any, ClassVar
+
+import numpy as np
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from vusfa.envs.rendering import draw_panels
+from vusfa.envs.world import World, env_specs, map_tensors
+from vusfa.errors import ConfigError
+from vusfa.scenes import SceneSet
+from vusfa.torchrl_private import StatelessEnv
+
+__all__ = ["SceneEnv"]
+
+
+class SceneEnv(StatelessEnv):
+    """Base of batched environments over scenes. A subclass sets :attr:`_world` and takes the steps.
+
+    Args:
+        scenes: the world.
+        batch_size: any shape.
+        history: frames in ``state_id``.
+        seed: where the environment's own random generator begins; None for somewhere else each time.
+
+    Raises:
+        ConfigError: ``scenes`` is no SceneSet, or ``batch_size`` is a number.
+    """
+
+    batch_locked: ClassVar[bool] = True
+    metadata: ClassVar[dict[str, Any]] = {"render_modes": ["rgb_array"], "render_fps": 4}
+    _world: World
+
+    def __init_subclass__(cls, **options: Any) -> None:
+        """Let :func:`inspect.signature` find the arguments, which TorchRL's metaclass hides."""
+        super().__init_subclass__(**options)
+        signature = inspect.signature(cls.__init__)
+        cls.__signature__ = signature.replace(parameters=list(signature.parameters.values())[1:])
+
+    def __init__(self, scenes: SceneSet, batch_size: Sequence[int], history: int, seed: int | None) -> None:
+        if not isinstance(scenes, SceneSet):
+            raise ConfigError(f"scenes is {scenes!r}; give a SceneSet, such as SceneSet.open(['bathroom'])")
+        if isinstance(batch_size, int):
+            raise ConfigError(f"batch_size is {batch_size}; give a list, [{batch_size}]")
+        super().__init__(device=torch.device("cpu"), batch_size=torch.Size(batch_size))
+        self.scenes = scenes.to("cpu")
+        self.history = history
+        self._generator = torch.Generator()
+        self._seed: int | None = None
+        self._set_seed(seed)
+        self._shown: tuple[Tensor, Tensor] | None = None
+
+    def _make_specs(self) -> None:
+        specs = env_specs(self.scenes, self.batch_size, self.history)
+        self.state_spec = specs.state
+        self.observation_spec = specs.observation
+        self.action_spec = specs.action
+        self.reward_spec = specs.reward
+        self.full_done_spec = specs.done
+
+    # -- randomness ------------------------------------------------------------------------------------------
+
+    def _set_seed(self, seed: int | None) -> None:
+        """Start the generator anew; None starts it somewhere else each time."""
+        self._seed = seed
+        if seed is None:
+            self._generator.seed()
+        else:
+            self._generator.manual_seed(seed)
+
+    @property
+    def generator(self) -> torch.Generator:
+        """The source of every draw."""
+        return self._generator
+
+    def get_rng_state(self) -> Tensor:
+        """State of the generator, a byte tensor on the CPU."""
+        return self._generator.get_state()
+
+    def set_rng_state(self, state: Tensor) -> None:
+        """Continue to draw from where :meth:`get_rng_state` was called, on a device of the same kind."""
+        self._generator.set_state(state.cpu())
+
+    def get_extra_state(self) -> Tensor:
+        """The generator's state, the content of :meth:`state_dict`."""
+        return self.get_rng_state()
+
+    def set_extra_state(self, state: Tensor) -> None:
+        """Restore the generator; called by :meth:`load_state_dict`."""
+        self.set_rng_state(state)
+
+    def load_state_dict(self, state_dict: Any, strict: bool = True, assign: bool = False) -> Any:
+        """Restore what :meth:`state_dict` gave; an empty one, as TorchRL's collectors keep, is ignored."""
+        return super().load_state_dict(state_dict, strict=strict and bool(state_dict), assign=assign)
+
+    # -- devices ---------------------------------------------------------------------------------------------
+
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> SceneEnv:
+        """Apply a function to all tensors, as every move of a module does; the tables move along."""
+        super()._apply(fn, recurse)
+        self._world = map_tensors(fn, self._world)
+        device = self._world.successor.device
+        if device != self._generator.device:
+            # A generator's state means nothing on another kind of device: draws begin again from the seed.
+            self._generator = torch.Generator(device)
+            self._set_seed(self._seed)
+        return self
+
+    # -- pictures --------------------------------------------------------------------------------------------
+
+    def _show(self, state_id: Tensor, goal_id: Tensor, mask: Tensor | None = None) -> None:
+        """Remember what :meth:`render` shows by default."""
+        if mask is not None and self._shown is not None:
+            mask = mask.reshape(self.batch_size)
+            state_id = torch.where(mask.unsqueeze(-1), state_id, self._shown[0])
+            goal_id = torch.where(mask, goal_id, self._shown[1])
+        self._shown = (state_id, goal_id)
+
+    def render(
+        self,
+        tensordict: TensorDictBase | None = None,
+        row: int | tuple[int, ...] = 0,
+        panels: Sequence[str] | None = None,
+    ) -> np.ndarray:
+        """Draw one agent.
+
+        Args:
+            tensordict: where the agents are (``state_id`` and ``goal_id``, of the environment's batch size);
+                by default what the environment returned last.
+            row: which agent, its index in the batch (in row-major order when a number).
+            panels: what to show from left to right: "view" what the agent sees, "goal" the goal's picture,
+                "map" the scene from above. By default the view, or the map where a scene has no pictures.
+
+        Returns:
+            (h, w, 3) uint8.
+
+        Raises:
+            ConfigError: nothing to show yet, no such row, or no such panel.
+            SceneError: the scene has no pictures.
+
+        >>> from vusfa.envs import TargetNavEnv
+        >>> env = TargetNavEnv(SceneSet.bundled(["bathroom"]), batch_size=[3])
+        >>> data = env.reset()
+        >>> env.render().shape, env.render(data, row=2, panels=("view", "map")).shape
+        ((150, 200, 3), (150, 358, 3))
+        """
+        if tensordict is not None:
+            state_id, goal_id = tensordict.get("state_id"), tensordict.get("goal_id")
+        elif self._shown is not None:
+            state_id, goal_id = self._shown
+        else:
+            raise ConfigError("there is nothing to render yet; call reset() first, or pass a tensordict")
+        try:
+            index = (
+                row if isinstance(row, tuple) else np.unravel_index(row, self.batch_size or (1,))[: self.ndim]
+            )
+            trail, goal = state_id[index].tolist(), int(goal_id[index])
+        except (IndexError, ValueError) as error:
+            raise ConfigError(f"there is no row {row}; the batch is {tuple(self.batch_size)}") from error
+        return draw_panels(self.scenes, trail, goal, panels)
