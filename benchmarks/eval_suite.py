@@ -10,7 +10,7 @@ from benchmarks.report import Options, Report, Requirement, Row
 from benchmarks.trainer import recipe_settings
 from vusfa.envs import resolve_goals
 from vusfa.evaluation import evaluate
-from vusfa.experiments.cells import evaluation_policy, evaluation_precision
+from vusfa.experiments.measure import evaluation_policy, evaluation_precision
 from vusfa.modules import ActingPolicy, make_agent
 from vusfa.scenes import SceneSet
 

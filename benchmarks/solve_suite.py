@@ -19,7 +19,7 @@ from benchmarks.peers.sb3 import make_sb3, sb3_actions
 from benchmarks.report import Options, Report, Requirement, Row, number
 from benchmarks.trainer import running, small
 from vusfa.evaluation import evaluate
-from vusfa.evaluation.metrics import length_ratio, success_rate
+from vusfa.evaluation.metrics import get_metric
 from vusfa.modules.presets import MODELS
 from vusfa.scenes import SceneSet
 
@@ -173,8 +173,8 @@ def checker(
 
     def check() -> tuple[float, float]:
         table = evaluate(policy, scenes, goals, episodes_per_goal=episodes, max_steps=limit, history=history)
-        detour = length_ratio(table.success, table.length, table.shortest)
-        return success_rate(table.success, table.length, limit), detour
+        detour = get_metric("length_ratio").value(table)
+        return get_metric(f"success_{limit}").value(table), detour
 
     return check
 

@@ -12,9 +12,10 @@ from pathlib import Path
 from omegaconf import DictConfig
 
 from vusfa.conf import FOLDER as CONF
-from vusfa.evaluation.curve import plot_curve
-from vusfa.evaluation.film import draw_film, longest_success, record_walk, write_gif
+from vusfa.evaluation.baselines import RANDOM_WALK
 from vusfa.experiments.training import train
+from vusfa.report.curve import plot_curve
+from vusfa.report.film import draw_film, longest_success, record_walk, write_gif
 from vusfa.training.launch import launch
 
 
@@ -26,9 +27,9 @@ def demo(cfg: DictConfig, overrides: list[str]) -> int:
     folder, agent, scenes = Path(cfg.folder), trainer.agent.eval(), trainer.scenes
     made, within = [], f"success_{cfg.evaluation.max_steps}"
     if (folder / "metrics.csv").is_file():  # nothing is logged when there was nothing left to train
-        floors = [row for row in result.rows if (row["policy"], row["goals"]) == ("random walk", "trained")]
-        floor = floors[0][within] if floors else None
-        made.append(plot_curve(folder / "metrics.csv", folder / "curve.png", floor, cfg.agent.model))
+        rows = [row for row in result.rows if (row["policy"], row["goals"]) == (RANDOM_WALK, "trained")]
+        random_walk = rows[0][within] if rows else None
+        made.append(plot_curve(folder / "metrics.csv", folder / "curve.png", random_walk, cfg.agent.model))
     found = longest_success(result.episodes, scenes)
     if found is not None:
         start, goal = found

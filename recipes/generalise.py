@@ -19,9 +19,9 @@ from omegaconf import OmegaConf
 
 from vusfa.errors import SceneError, VusfaError
 from vusfa.evaluation import Episodes, evaluate, print_summary, random_walk_summary, summary
-from vusfa.evaluation.exact import exact_goals
-from vusfa.experiments.results import Cell, read_cells, write_cell
-from vusfa.experiments.unseen import unseen_table
+from vusfa.evaluation.exact import exact_goals, uniform_probabilities
+from vusfa.experiments.generalise import unseen_table
+from vusfa.experiments.runs import Run, read_runs, write_run
 from vusfa.modules import ActingPolicy, TriedActions, transplant
 from vusfa.scenes import SceneSet
 from vusfa.training import EvaluationProgress, load_agent, run_facts
@@ -51,11 +51,6 @@ def split_rooms(folder: Path, trained: int, tested: int) -> tuple[list[str], lis
             " 'vusfa scenes render', or ask for fewer"
         )
     return [str(path) for path in files[:trained]], [str(path) for path in files[-tested:]]
-
-
-def uniform(state: torch.Tensor, num_actions: int) -> torch.Tensor:
-    """The random walk's probabilities, (R, A) for R states."""
-    return torch.full((len(state), num_actions), 1 / num_actions)
 
 
 def policies(agent: Any, scenes: SceneSet, weight: float, temperature: float) -> dict[str, Any]:
@@ -120,14 +115,12 @@ def generalise(
             )
     facts = {**run_facts(state, overrides), "trained_in": [Path(p).stem for p in first]}
     info = {**facts, "memory_weight": weight, "temperature": temperature, "tested_in": list(unseen.names)}
-    walk = exact_goals(lambda state, goal, scene: uniform(state, unseen.num_actions), unseen)
-    print(write_cell(results, Cell("generalise", f"{name}-{seed}", info, tables, walk)))
+    walk = exact_goals(uniform_probabilities(unseen.num_actions), unseen)
+    print(write_run(results, Run("generalise", f"{name}-{seed}", info, tables, walk)))
     rows = [row for who, table in tables.items() for row in summary(table, who)]
     none, every = torch.tensor([], dtype=torch.int64), torch.arange(unseen.num_states)
     print_summary([*rows, *random_walk_summary(unseen, every, none)])
-    print(
-        unseen_table([cell for cell in read_cells(results, "generalise") if cell.name.startswith(f"{name}-")])
-    )
+    print(unseen_table([run for run in read_runs(results, "generalise") if run.name.startswith(f"{name}-")]))
 
 
 if __name__ == "__main__":

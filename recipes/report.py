@@ -33,7 +33,7 @@ def report(
     seeds: int = 1,
     walks: int = 3,
     max_steps: int = 500,
-    way: Literal["sampled", "greedy"] = "sampled",
+    mode: Literal["sampled", "greedy"] = "sampled",
     runs: Path = Path("runs"),
     megabytes: float = 40.0,
     wandb: Literal["online", "offline"] | None = None,
@@ -50,7 +50,7 @@ def report(
         seeds: runs of each model in the explorer, the first ones given.
         walks: sampled walks to each of these goals.
         max_steps: actions allowed in these walks.
-        way: of the evaluations that results hold.
+        mode: of the evaluations that results hold.
         runs: where the trainings of results keep logs and checkpoints, as RUNS/EXPERIMENT/CELL.
         megabytes: what the page may weigh; goals, then pictures are left out to keep it.
         wandb: send the tables to W&B, too; offline leaves them beside the page.
@@ -69,7 +69,7 @@ def report(
         command=shlex.join(["python", "recipes/report.py", *sources, "--out", str(out)]),
         tell=lambda line: print(line, file=sys.stderr),
     )
-    read = [run for source in sources for run in read_source(source, way, runs)]
+    read = [run for source in sources for run in read_source(source, mode, runs)]
     paths, tables = write_report(read, out, options)
     if wandb:
         kept, made = {"sources": sources, "title": title}, uuid.uuid4().hex[:8]

@@ -17,8 +17,8 @@ import tyro
 from omegaconf import OmegaConf, open_dict
 
 from vusfa.errors import VusfaError
-from vusfa.experiments.cells import choose_checkpoint, measure_checkpoint
-from vusfa.experiments.results import read_cell, write_cell
+from vusfa.experiments.measure import choose_checkpoint, measure_checkpoint
+from vusfa.experiments.runs import read_run, write_run
 from vusfa.files import replacing
 from vusfa.modules.presets import MODELS
 from vusfa.training.launch import compose
@@ -82,21 +82,21 @@ def table1(
                 print(f"{results / experiment / name}: already there")
                 continue
             if there:
-                info = read_cell(results, experiment, name).info
+                info = read_run(results, experiment, name).info
                 chosen, settings = run / info["checkpoint"], info["overrides"]
-                told = {key: info[key] for key in ("validation_spl", "cell_s") if key in info}
-                told |= {"model": model, "row": model} if model == "untrained" else {}
+                facts = {key: info[key] for key in ("validation_spl", "cell_s") if key in info}
+                facts |= {"model": model, "row": model} if model == "untrained" else {}
             else:
                 untrained = model == "untrained"
                 settings = [*overrides, f"agent.model={'vusfa' if untrained else model}", f"seed={seed}"]
                 kept = checkpoints(run, settings, [0.0] if untrained else sorted(stages))
                 scores = choose_checkpoint(kept, manifest)
                 chosen = next(iter(scores))
-                told = {"validation_spl": {path.name: score for path, score in scores.items()}}
-                told |= {"model": model, "row": model} if untrained else {}
-            cell = measure_checkpoint(chosen, experiment, name, settings, manifest)
-            told.setdefault("cell_s", round(time.monotonic() - began, 1))
-            print(write_cell(results, dataclasses.replace(cell, info={**cell.info, **told})))
+                facts = {"validation_spl": {path.name: score for path, score in scores.items()}}
+                facts |= {"model": model, "row": model} if untrained else {}
+            measured = measure_checkpoint(chosen, experiment, name, settings, manifest)
+            facts.setdefault("cell_s", round(time.monotonic() - began, 1))
+            print(write_run(results, dataclasses.replace(measured, info={**measured.info, **facts})))
 
 
 if __name__ == "__main__":

@@ -19,10 +19,10 @@ from rich.progress import track
 
 from vusfa.errors import CheckpointError, VusfaError
 from vusfa.experiments.fine_tune import fine_tune, fine_tuning_settings
-from vusfa.experiments.results import Cell, read_cell, read_cells, write_cell
+from vusfa.experiments.runs import Run, read_run, read_runs, write_run
 from vusfa.experiments.transfer import KINDS, new_goals, walked_lengths
-from vusfa.experiments.transfer_figure import difference_table, draw_transfer, transfer_table
 from vusfa.modules.presets import MODELS
+from vusfa.report.transfer_figure import difference_table, draw_transfer, transfer_table
 from vusfa.scenes import SceneSet
 from vusfa.training import load_agent, run_facts, set_threads
 
@@ -62,7 +62,7 @@ def run(
                 if (results / experiment / name / "cell.json").exists():
                     print(f"{results / experiment / name}: already there")
                     continue
-                trained = read_cell(results, source, f"{model}-{seed}").info["checkpoint"]
+                trained = read_run(results, source, f"{model}-{seed}").info["checkpoint"]
                 checkpoint = runs / source / f"{model}-{seed}" / trained
                 if not checkpoint.exists():
                     raise CheckpointError(
@@ -86,7 +86,7 @@ def run(
                     "command": f"recipes/transfer.py run --models {model} --seeds {seed} --kinds {kind}",
                     "curves": curves,
                 }
-                print(write_cell(results, Cell(experiment, name, info, {})))
+                print(write_run(results, Run(experiment, name, info, {})))
 
 
 def show(
@@ -107,14 +107,14 @@ def show(
         scenes: bundled names and files, in order; the bundled rooms that the cells name when not given.
         out: the picture.
     """
-    cells = read_cells(results, experiment)
-    if not cells:
+    found = read_runs(results, experiment)
+    if not found:
         raise VusfaError(f"{results / experiment}: no results; run recipes/transfer.py run first")
-    world = SceneSet.open(scenes or cells[0].info["scenes"])
-    sets = {cell.info["kind"]: [entry["goals"] for entry in cell.info["curves"]] for cell in cells}
+    world = SceneSet.open(scenes or found[0].info["scenes"])
+    sets = {run.info["kind"]: [entry["goals"] for entry in run.info["curves"]] for run in found}
     bounds = {kind: [walked_lengths(world, torch.tensor(g)) for g in goals] for kind, goals in sets.items()}
-    print(transfer_table(cells, threshold, bounds), difference_table(cells), sep="\n\n")
-    print(draw_transfer(cells, out, bounds))
+    print(transfer_table(found, threshold, bounds), difference_table(found), sep="\n\n")
+    print(draw_transfer(found, out, bounds))
 
 
 if __name__ == "__main__":

@@ -17,8 +17,8 @@ import tyro
 
 from vusfa.errors import VusfaError
 from vusfa.evaluation import compare, print_summary
-from vusfa.experiments.cells import evaluation_policy, evaluation_precision
 from vusfa.experiments.manifest import BUNDLED_MANIFEST, read_manifest
+from vusfa.experiments.measure import evaluation_policy, evaluation_precision
 from vusfa.files import check_folder
 from vusfa.training import (
     EvaluationProgress,

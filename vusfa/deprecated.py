@@ -19,16 +19,23 @@ __all__ = ["MOVED_MODULES", "install", "moved_names"]
 
 #: Modules of version 0.1 and what they are called now.
 MOVED_MODULES: dict[str, str] = {
+    "vusfa.evaluation.curve": "vusfa.report.curve",
     "vusfa.evaluation.files": "vusfa.files",
+    "vusfa.evaluation.film": "vusfa.report.film",
+    "vusfa.evaluation.floors": "vusfa.evaluation.baselines",
+    "vusfa.evaluation.report": "vusfa.evaluation.summary",
+    "vusfa.evaluation.results": "vusfa.experiments.runs",
+    "vusfa.evaluation.transfer_figure": "vusfa.report.transfer_figure",
+    "vusfa.evaluation.unseen": "vusfa.experiments.generalise",
     "vusfa.scenes.faults": "vusfa.scenes.validation",
-    "vusfa.training.cells": "vusfa.experiments.cells",
+    "vusfa.training.cells": "vusfa.experiments.measure",
     "vusfa.training.learning": "vusfa.training.optimization",
     "vusfa.training.replay": "vusfa.algorithms.replay",
     "vusfa.training.session": "vusfa.training.trainer",
     "vusfa.training.transfer": "vusfa.experiments.fine_tune",
     **{
         f"vusfa.evaluation.{name}": f"vusfa.experiments.{name}"
-        for name in ("experiment", "tables", "results", "transfer", "transfer_figure", "unseen", "manifest")
+        for name in ("experiment", "tables", "transfer", "manifest")
     },
     **{
         f"vusfa.scenes.{name}": f"vusfa.sources.{name}"

@@ -5,16 +5,14 @@ from collections.abc import Callable
 import pytest
 import torch
 from torch import Tensor
+from torch.nn.functional import one_hot
 
-from vusfa.evaluation import evaluate
-from vusfa.evaluation.exact import agent_probabilities, exact_goals, expected_walks, reach_step
-from vusfa.evaluation.metrics import spl
+from vusfa.evaluation import evaluate, get_metric
+from vusfa.evaluation.exact import exact_goals, expected_walks, uniform_probabilities
+from vusfa.evaluation.tabulated import TabulatedPolicy
 from vusfa.modules import ActingPolicy, Agent, make_agent
 from vusfa.scenes import Scene, SceneSet
-
-
-def uniform(state: Tensor, goal: Tensor, scene: Tensor) -> Tensor:
-    return torch.full((len(state), 4), 0.25)
+from vusfa.scenes.markov import arrival_by_step
 
 
 @pytest.fixture
@@ -34,10 +32,8 @@ def agent(rooms: SceneSet) -> Agent:
 
 def test_a_step_by_hand() -> None:
     """Two states, one action that goes there with the chance p and one that stays."""
-    successor, goal = torch.tensor([[1, 0], [1, 1]]), torch.tensor([1])
-    chance = torch.tensor([[0.0, 1.0]])
-    for k in range(1, 5):
-        chance = reach_step(torch.tensor([[[0.3, 0.7], [0.5, 0.5]]]), successor, goal, chance)
+    graph, acts = torch.tensor([[1, 0], [1, 1]]), torch.tensor([[[0.3, 0.7], [0.5, 0.5]]])
+    for k, chance in zip(range(5), arrival_by_step(graph, acts, [1]), strict=False):
         assert chance[0, 0].item() == pytest.approx(1 - 0.7**k)
 
 
@@ -46,43 +42,47 @@ def test_a_corridor_by_hand() -> None:
     k)."""
     corridor = torch.tensor([[1, -1], [2, -1], [-1, -1]])
     scenes = SceneSet([Scene("corridor", corridor, torch.rand(3, 1, 4))])
-    table = exact_goals(lambda state, goal, scene: torch.full((len(state), 2), 0.5), scenes)
+    table = exact_goals(uniform_probabilities(2), scenes)
     assert table.goal.tolist() == [1, 2]  # nothing leads to the first
     one = sum(0.5**k / k for k in range(1, 501))
     two = sum((k - 1) * 0.5**k * 2 / k for k in range(2, 501))
-    torch.testing.assert_close(table.spl, torch.tensor([one, (one + two) / 2], dtype=torch.float64))
-    torch.testing.assert_close(table.success_500, torch.ones(2, dtype=torch.float64))
+    torch.testing.assert_close(
+        table.metrics["spl"], torch.tensor([one, (one + two) / 2], dtype=torch.float64)
+    )
+    torch.testing.assert_close(table.metrics["success_500"], torch.ones(2, dtype=torch.float64))
     missed = 0.5**100, (0.5**100 + 101 * 0.5**100) / 2
     torch.testing.assert_close(
-        1 - table.success_100, torch.tensor(missed, dtype=torch.float64), atol=1e-12, rtol=0
+        1 - table.metrics["success_100"], torch.tensor(missed, dtype=torch.float64), atol=1e-12, rtol=0
     )
 
 
 @pytest.mark.parametrize("greedy", [False, True])
 def test_beside_sampled_episodes(rooms: SceneSet, agent: Agent, greedy: bool) -> None:
     """Each mean of 400 episodes a goal lies within five of its standard errors of what is computed."""
-    exact = exact_goals(agent_probabilities(agent, greedy), rooms, agent)
+    table = TabulatedPolicy(agent, rooms)
+
+    def likeliest(state: Tensor, goal: Tensor, scene: Tensor) -> Tensor:
+        return one_hot(table.logits(state, goal).argmax(-1), 4).double()
+
+    probabilities = likeliest if greedy else table.probabilities
+    exact = exact_goals(probabilities, rooms)
     sampled = evaluate(
         ActingPolicy(agent), rooms, episodes_per_goal=400, max_steps=500, history=1, sample=not greedy
     )
-    assert exact.success_100.min() < 1
+    assert exact.metrics["success_100"].min() < 1
     for row in range(len(exact.goal)):
         here = sampled.select((sampled.goal == exact.goal[row]) & (sampled.scene == exact.scene[row]))
         within = (here.success & (here.length <= 100)).double().mean()
         error = max(0.004, 0.025 * 4 * float(within * (1 - within)) ** 0.5)
-        assert abs(within - exact.success_100[row]) < 2.5 * error
-        assert abs(spl(here.success, here.length, here.shortest) - exact.spl[row]) < 0.125
+        assert abs(within - exact.metrics["success_100"][row]) < 2.5 * error
+        assert abs(get_metric("spl").value(here) - exact.metrics["spl"][row]) < 0.125
 
 
 def test_goals_are_computed_together_or_apart(rooms: SceneSet, agent: Agent) -> None:
-    tables = [exact_goals(agent_probabilities(agent), rooms, at_once=size) for size in (5, 64)]
-    torch.testing.assert_close(tables[0].spl, tables[1].spl, atol=1e-5, rtol=1e-5)
+    policy = TabulatedPolicy(agent, rooms)
+    tables = [exact_goals(policy.probabilities, rooms, at_once=size) for size in (5, 64)]
+    torch.testing.assert_close(tables[0].metrics["spl"], tables[1].metrics["spl"], atol=1e-5, rtol=1e-5)
     assert torch.equal(tables[0].goal, tables[1].goal)
-
-
-def test_an_agent_of_more_frames_is_refused(rooms: SceneSet) -> None:
-    with pytest.raises(ValueError, match="history=4"):
-        agent_probabilities(make_agent("gvf", scenes=rooms))
 
 
 def test_expected_walks_in_a_corridor_by_hand() -> None:
@@ -103,11 +103,12 @@ def test_expected_walks_in_a_corridor_by_hand() -> None:
 
 
 def test_expected_walks_of_an_agent_beside_the_table_of_all_goals(rooms: SceneSet, agent: Agent) -> None:
-    chances, every = agent_probabilities(agent), exact_goals(agent_probabilities(agent), rooms)
+    chances = TabulatedPolicy(agent, rooms).probabilities
+    every = exact_goals(chances, rooms)
     goals = torch.tensor([2, 7, 18])
     rows = [int(((every.scene == scene) & (every.goal == goal)).nonzero()) for scene, goal in
             ((0, 2), (0, 7), (1, 2))]  # fmt: skip
-    for steps, column in ((100, every.success_100), (500, every.success_500)):
+    for steps, column in ((100, every.metrics["success_100"]), (500, every.metrics["success_500"])):
         walks = expected_walks(chances, rooms, goals, steps)
         torch.testing.assert_close(walks.success, column[rows], atol=1e-4, rtol=1e-4)
     assert bool((walks.length >= walks.shortest).all())

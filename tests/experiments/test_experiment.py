@@ -12,9 +12,10 @@ import torch
 
 from vusfa.errors import ResultError
 from vusfa.evaluation import Episodes, episode_starts, evaluate, random_walk
-from vusfa.evaluation.exact import exact_goals
-from vusfa.experiments.experiment import Experiment, episode_sums, nearest_trained, read_experiment
-from vusfa.experiments.results import Cell, read_cell, write_cell
+from vusfa.evaluation.exact import exact_goals, uniform_probabilities
+from vusfa.evaluation.long_table import distance_to_trained, episode_rows
+from vusfa.experiments.experiment import Experiment, read_experiment
+from vusfa.experiments.runs import Run, read_run, write_run
 from vusfa.scenes import Scene, SceneSet
 
 Policies = dict[str, Callable[..., Any]]
@@ -33,12 +34,12 @@ def walked(rooms: SceneSet, policies: Policies) -> Callable[..., Episodes]:
 
 @pytest.fixture
 def results(tmp_path: Path, rooms: SceneSet, walked: Callable[..., Episodes]) -> Path:
-    chances = exact_goals(lambda s, g, i: torch.full((len(s), 4), 0.25), rooms)
+    chances = exact_goals(uniform_probabilities(4), rooms)
     for seed in (1, 0):
         info = {"model": "vusfa", "row": "vusfa", "seed": seed, "agent_preset": "controlled"}
-        write_cell(tmp_path, Cell("a", f"vusfa-{seed}", info, {"sampled": walked("dice", seed)}, chances))
+        write_run(tmp_path, Run("a", f"vusfa-{seed}", info, {"sampled": walked("dice", seed)}, chances))
     info = {"model": "gvf", "seed": 0, "agent_preset": "paper"}
-    write_cell(tmp_path, Cell("a", "gvf-0", info, {"sampled": walked("guide", 0, rooms)}))
+    write_run(tmp_path, Run("a", "gvf-0", info, {"sampled": walked("guide", 0, rooms)}))
     return tmp_path
 
 
@@ -48,7 +49,7 @@ def experiment(results: Path, rooms: SceneSet) -> Experiment:
 
 
 def test_cells_are_grouped_and_in_order(experiment: Experiment) -> None:
-    assert list(experiment.cells) == ["vusfa", "gvf (paper)"]
+    assert list(experiment.runs) == ["vusfa", "gvf (paper)"]
     assert experiment.seeds("vusfa") == [0, 1]
     assert experiment.goal.tolist() == [3, 9, 4, 14]
     assert experiment.scene.tolist() == [0, 0, 1, 1]
@@ -57,7 +58,7 @@ def test_cells_are_grouped_and_in_order(experiment: Experiment) -> None:
 
 def test_sums_are_those_of_the_episodes(experiment: Experiment) -> None:
     sums = experiment.sums("vusfa", "sampled")
-    for row, cell in enumerate(experiment.cells["vusfa"]):
+    for row, cell in enumerate(experiment.runs["vusfa"]):
         rows = list(cell.episodes["sampled"].rows())
         for column, goal in enumerate([("hall", 3), ("hall", 9), ("attic", 4), ("attic", 14)]):
             mine = [walk for walk in rows if (walk["scene"], walk["goal"]) == goal]
@@ -84,8 +85,8 @@ def test_sums_are_those_of_the_episodes(experiment: Experiment) -> None:
 def test_what_is_not_there_is_left_out(experiment: Experiment) -> None:
     assert experiment.sums("vusfa", "greedy") == {}
     assert experiment.sums("gvf (paper)", "exact") == {}
-    table = replace(experiment.cells["vusfa"][0].episodes["sampled"], remaining=None)
-    assert "soft_spl" not in episode_sums(table, experiment.place, 4)
+    table = replace(experiment.runs["vusfa"][0].episodes["sampled"], remaining=None)
+    assert "soft_spl" not in set(episode_rows(table, "vusfa").metric)
 
 
 def test_floor_and_ceiling(experiment: Experiment, rooms: SceneSet) -> None:
@@ -104,7 +105,7 @@ def test_floor_and_ceiling(experiment: Experiment, rooms: SceneSet) -> None:
 def test_other_episodes_are_refused(results: Path, rooms: SceneSet, walked: Callable[..., Episodes]) -> None:
     table = walked()
     odd = replace(table, start=table.start.flip(0))
-    write_cell(results, Cell("a", "odd", {"model": "usfa", "seed": 0}, {"sampled": odd}))
+    write_run(results, Run("a", "odd", {"model": "usfa", "seed": 0}, {"sampled": odd}))
     with pytest.raises(ResultError, match=r"a/odd: the episodes of sampled are not those of gvf-0"):
         read_experiment(results, ["a"], rooms)
     with pytest.raises(ResultError, match="no results of b or c"):
@@ -112,9 +113,9 @@ def test_other_episodes_are_refused(results: Path, rooms: SceneSet, walked: Call
 
 
 def test_other_scenes_are_refused(results: Path, rooms: SceneSet) -> None:
-    cell = read_cell(results, "a", "gvf-0")
+    cell = read_run(results, "a", "gvf-0")
     told = {**cell.info, "scenes_fingerprint": "abc", "scenes": ["bathroom"]}
-    write_cell(results, replace(cell, info=told))
+    write_run(results, replace(cell, info=told))
     for scenes in (rooms, None):
         with pytest.raises(ResultError, match=r"a/gvf-0: of other scenes \(fingerprint abc"):
             read_experiment(results, ["a"], scenes)
@@ -124,7 +125,7 @@ def test_distance_from_the_nearest_trained_goal(make_scene: Callable[..., Scene]
     rooms = SceneSet([make_scene("hall"), make_scene("attic")])
     scene, goal = torch.arange(2).repeat_interleave(16), torch.arange(16).repeat(2)
     trained = (scene == 0) & ((goal == 2) | (goal == 13))
-    away = nearest_trained(rooms, scene, goal, trained)
+    away = distance_to_trained(rooms, scene, goal, trained)
     distance = rooms.scenes[0].distance
     expected = [min(int(distance[2, state]), int(distance[13, state])) for state in range(16)]
     assert away.tolist() == expected + [-1] * 16
@@ -132,5 +133,5 @@ def test_distance_from_the_nearest_trained_goal(make_scene: Callable[..., Scene]
 
 def test_an_island_is_far_from_everything(island: SceneSet) -> None:
     goal = torch.arange(5)
-    away = nearest_trained(island, goal * 0, goal, goal == 3)
+    away = distance_to_trained(island, goal * 0, goal, goal == 3)
     assert away.tolist() == [-1, -1, -1, 0, -1]  # the trap is never left

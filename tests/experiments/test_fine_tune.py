@@ -9,8 +9,7 @@ import torch
 from omegaconf import OmegaConf
 
 from vusfa.conf import FOLDER as CONF
-from vusfa.evaluation import evaluate
-from vusfa.evaluation.metrics import length_ratio
+from vusfa.evaluation import evaluate, get_metric
 from vusfa.experiments.fine_tune import fine_tune, fine_tuning_settings
 from vusfa.modules import ActingPolicy
 from vusfa.scenes import SceneSet
@@ -114,5 +113,5 @@ def test_what_is_computed_beside_what_is_walked(config: dict[str, Any], checkpoi
     length = table.length.double()
     assert curve["length"][0] == pytest.approx(length.mean().item(), abs=5 * 8 / 9000**0.5)
     assert curve["success"][0] == pytest.approx(table.success.double().mean().item(), abs=5 * 0.5 / 9000**0.5)
-    ratio = length_ratio(table.success, table.length, table.shortest)
+    ratio = get_metric("length_ratio").value(table)
     assert curve["length_ratio"][0] == pytest.approx(ratio, rel=0.05)

@@ -13,15 +13,15 @@ from vusfa.evaluation import Episodes
 from vusfa.evaluation.exact import ExactGoals
 from vusfa.evaluation.statistics import Estimate
 from vusfa.experiments.experiment import Experiment, read_experiment
-from vusfa.experiments.results import Cell, write_cell
+from vusfa.experiments.runs import Run, write_run
 from vusfa.experiments.tables import (
-    cell_rows,
     comparison_rows,
     distance_rows,
     flat_rows,
     markdown,
     middle_rows,
     model_rows,
+    run_rows,
 )
 from vusfa.scenes import SceneSet
 
@@ -56,9 +56,13 @@ def experiment(tmp_path: Path, rooms: SceneSet) -> Experiment:
         table = episodes(rooms, dict(zip(places, counts, strict=True)))
         chance = torch.full((4,), 0.5, dtype=torch.float64)
         scene, goal = (torch.tensor(column) for column in zip(*places, strict=True))
-        exact = ExactGoals(scene, goal, chance, chance, chance) if model == "usfa" else None
+        exact = (
+            ExactGoals(scene, goal, dict.fromkeys(("success_500", "success_100", "spl"), chance))
+            if model == "usfa"
+            else None
+        )
         info = {"model": model, "seed": seed, "agent_preset": "controlled", "frames": 1000, "training_s": 2.5}
-        write_cell(tmp_path, Cell("a", f"{model}-{seed}", info, {"sampled": table}, exact))
+        write_run(tmp_path, Run("a", f"{model}-{seed}", info, {"sampled": table}, exact))
     return read_experiment(tmp_path, ["a"], rooms)
 
 
@@ -68,7 +72,7 @@ def find(rows: list[dict[str, Any]], **wanted: Any) -> dict[str, Any]:
 
 
 def test_cells_say_what_is_solved_and_how_far_from_exact(experiment: Experiment) -> None:
-    rows = cell_rows(experiment)
+    rows = run_rows(experiment)
     assert [(row["model"], row["seed"], row["trained"], row["solved"]) for row in rows] == [
         ("gvf", 0, 1.0, True), ("gvf", 1, 1.0, True), ("usfa", 0, 0.5, False), ("usfa", 1, 1.0, True),
     ]  # fmt: skip

@@ -9,9 +9,9 @@ import torch
 
 from vusfa.envs import resolve_goals
 from vusfa.errors import GoalError
-from vusfa.experiments.results import Cell
+from vusfa.experiments.runs import Run
 from vusfa.experiments.transfer import KINDS, area_under, frames_to, new_goals, walked_lengths
-from vusfa.experiments.transfer_figure import difference_table, draw_transfer, mean_over, transfer_table
+from vusfa.report.transfer_figure import difference_table, draw_transfer, mean_over, transfer_table
 from vusfa.scenes import Scene, SceneSet
 
 
@@ -66,7 +66,7 @@ def test_mean_over_leaves_out_what_never_came_there() -> None:
     assert 1.0 <= estimate.low <= 3.0 <= estimate.high <= 5.0
 
 
-def cell(model: str, seed: int, lengths: list[list[float]]) -> Cell:
+def cell(model: str, seed: int, lengths: list[list[float]]) -> Run:
     curves = [
         {
             "trained on": {"frames": [0, 100, 200], "length": row},
@@ -75,7 +75,7 @@ def cell(model: str, seed: int, lengths: list[list[float]]) -> Cell:
         for row in lengths
     ]
     info = {"model": model, "seed": seed, "kind": "1-step", "curves": curves}
-    return Cell("transfer", f"{model}-{seed}", info, {})
+    return Run("transfer", f"{model}-{seed}", info, {})
 
 
 def test_the_table_by_hand() -> None:

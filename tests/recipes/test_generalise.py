@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from vusfa.errors import SceneError
-from vusfa.experiments.results import read_cell
+from vusfa.experiments.runs import read_run
 from vusfa.scenes import Scene
 
 SMALL = [
@@ -45,7 +45,7 @@ def test_trained_in_some_rooms_and_tested_in_others(
     folders = {"results": tmp_path / "results", "runs": tmp_path / "runs"}
     asked: dict[str, Any] = {"trained": 3, "tested": 1, "episodes": 2, **folders}
     recipe("generalise").generalise(rooms, SMALL, **asked)
-    cell = read_cell(tmp_path / "results", "generalise", "vusfa-0")
+    cell = read_run(tmp_path / "results", "generalise", "vusfa-0")
     assert cell.info["trained_in"] == ["hall-1", "attic-2", "attic-9"]
     assert cell.info["tested_in"] == ["hall"]
     assert sorted(cell.episodes) == ["agent", "agent-memory", "memory"]
@@ -56,5 +56,5 @@ def test_trained_in_some_rooms_and_tested_in_others(
     assert "random walk" in printed
     assert "agent-memory" in printed
     recipe("generalise").generalise(rooms, SMALL, **asked)  # the checkpoint is there: the same numbers
-    again = read_cell(tmp_path / "results", "generalise", "vusfa-0")
+    again = read_run(tmp_path / "results", "generalise", "vusfa-0")
     assert again.episodes["agent"].equal(cell.episodes["agent"])

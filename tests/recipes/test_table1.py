@@ -12,7 +12,7 @@ import torch
 
 from vusfa.envs import resolve_goals
 from vusfa.experiments.manifest import make_manifest, write_manifest
-from vusfa.experiments.results import read_cell, read_cells, write_cell
+from vusfa.experiments.runs import read_run, read_runs, write_run
 from vusfa.scenes import SceneSet
 
 SMALL = [
@@ -44,7 +44,7 @@ def test_a_cell_is_run_once_and_again_gives_the_same(
     table1: Any, folders: dict[str, Path], capsys: pytest.CaptureFixture[str]
 ) -> None:
     table1.table1(SMALL, models=["vusfa", "gvf"], seeds=[0], **folders)
-    cells = {cell.name: cell for cell in read_cells(folders["results"], "table1")}
+    cells = {cell.name: cell for cell in read_runs(folders["results"], "table1")}
     assert sorted(cells) == ["gvf-0", "vusfa-0"]
     cell = cells["vusfa-0"]
     scores = cell.info["validation_spl"]
@@ -62,7 +62,7 @@ def test_a_cell_is_run_once_and_again_gives_the_same(
     assert "already there" in capsys.readouterr().out
     folders["results"], folders["runs"] = folders["results"] / "again", folders["runs"] / "again"
     table1.table1(SMALL, models=["vusfa"], seeds=[0], **folders)
-    assert read_cell(folders["results"], "table1", "vusfa-0").episodes["sampled"].equal(sampled)
+    assert read_run(folders["results"], "table1", "vusfa-0").episodes["sampled"].equal(sampled)
 
 
 def test_a_cell_goes_on_where_it_was_cut_off(
@@ -71,11 +71,11 @@ def test_a_cell_goes_on_where_it_was_cut_off(
     monkeypatch.setattr(table1, "choose_checkpoint", _interrupt)
     with pytest.raises(KeyboardInterrupt):
         table1.table1(SMALL, models=["gvf"], seeds=[1], **folders)
-    assert read_cells(folders["results"], "table1") == []
+    assert read_runs(folders["results"], "table1") == []
     monkeypatch.setattr(table1, "train", None)  # nothing is trained twice
     monkeypatch.setattr(table1, "choose_checkpoint", lambda paths, manifest: {paths[1]: 0.5, paths[0]: 0.4})
     table1.table1(SMALL, models=["gvf"], seeds=[1], **folders)
-    cell = read_cell(folders["results"], "table1", "gvf-1")
+    cell = read_run(folders["results"], "table1", "gvf-1")
     assert (cell.info["seed"], cell.info["checkpoint"]) == (1, "checkpoint-90.pt")
 
 
@@ -85,12 +85,12 @@ def _interrupt(*arguments: object) -> float:
 
 def test_untrained_and_measured_again(table1: Any, folders: dict[str, Path]) -> None:
     table1.table1(SMALL, models=["untrained"], seeds=[2], **folders)
-    cell = read_cell(folders["results"], "table1", "untrained-2")
+    cell = read_run(folders["results"], "table1", "untrained-2")
     assert (cell.info["model"], cell.info["row"], cell.info["frames"]) == ("untrained", "untrained", 0)
     old = {way: dataclasses.replace(table, remaining=None) for way, table in cell.episodes.items()}
-    write_cell(folders["results"], dataclasses.replace(cell, episodes=old))
+    write_run(folders["results"], dataclasses.replace(cell, episodes=old))
     table1.table1(SMALL, models=["untrained"], seeds=[2], again=True, **folders)
-    anew = read_cell(folders["results"], "table1", "untrained-2")
+    anew = read_run(folders["results"], "table1", "untrained-2")
     assert anew.info == cell.info
     for way, table in anew.episodes.items():
         assert table.equal(cell.episodes[way])

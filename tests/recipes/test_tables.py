@@ -31,7 +31,7 @@ def test_all_tables(recipe: Callable[[str], Any], tmp_path: Path, capsys: pytest
     recipe("tables").tables(["table1"], results=results, resamples=50)
     out = capsys.readouterr().out
     for title in (
-        "Cells",
+        "Runs",
         "Unseen goals, the likeliest action",
         "All goals, computed, actions drawn",
         "Interquartile mean over seeds and scenes, actions drawn",
@@ -43,8 +43,8 @@ def test_all_tables(recipe: Callable[[str], Any], tmp_path: Path, capsys: pytest
     assert "Trained goals NOT solved" in out  # after 160 frames
     with open(results / "tables" / "models.csv", newline="", encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
-    assert {row["way"] for row in rows} == {"sampled", "greedy", "exact"}
-    row = next(row for row in rows if (row["model"], row["goals"], row["way"]) == ("gvf", "all", "sampled"))
+    assert {row["mode"] for row in rows} == {"sampled", "greedy", "exact"}
+    row = next(row for row in rows if (row["model"], row["goals"], row["mode"]) == ("gvf", "all", "sampled"))
     assert float(row["spl_low"]) <= float(row["spl"]) <= float(row["spl_high"])
 
 

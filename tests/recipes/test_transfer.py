@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from vusfa.errors import CheckpointError, VusfaError
-from vusfa.experiments.results import Cell, read_cell, write_cell
+from vusfa.experiments.runs import Run, read_run, write_run
 
 
 @pytest.fixture
@@ -18,7 +18,7 @@ def folders(
 ) -> dict[str, Path]:
     folder = tmp_path / "runs" / "table1" / "gvf-0"
     recipe("train").train(settings(*small, "agent.model=gvf", f"folder={folder}"), [])
-    write_cell(tmp_path / "results", Cell("table1", "gvf-0", {"checkpoint": "checkpoint.pt"}, {}))
+    write_run(tmp_path / "results", Run("table1", "gvf-0", {"checkpoint": "checkpoint.pt"}, {}))
     return {"results": tmp_path / "results", "runs": tmp_path / "runs"}
 
 
@@ -32,7 +32,7 @@ def test_run_and_show(
     transfer = recipe("transfer")
     asked = {"models": ["gvf"], "seeds": [0], "kinds": ["random"], "sets": 2, "frames": 96, "every": 48}
     transfer.run(**asked, **folders)
-    info = read_cell(folders["results"], "transfer", "gvf-0-random").info
+    info = read_run(folders["results"], "transfer", "gvf-0-random").info
     assert [len(entry["goals"]) for entry in info["curves"]] == [5, 5]
     assert info["curves"][0]["trained on"]["frames"] == [0, 48, 96]
     assert info["curves"][0]["trained on"] != info["curves"][0]["from scratch"]

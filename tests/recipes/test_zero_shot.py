@@ -14,7 +14,7 @@ import torch
 from vusfa.envs import resolve_goals
 from vusfa.errors import ResultError
 from vusfa.experiments.manifest import make_manifest, write_manifest
-from vusfa.experiments.results import read_cell
+from vusfa.experiments.runs import read_run
 from vusfa.scenes import SceneSet
 
 ZERO_SHOT = Path(__file__).parents[2] / "recipes" / "zero_shot.py"
@@ -80,7 +80,7 @@ def test_the_episodes_of_a_manifest(recipe, tmp_path: Path):
     )
     checkpoint = runs / "table1" / "vusfa-0" / "checkpoint-100.pt"
     recipe("zero_shot").zero_shot(checkpoint, manifest=str(manifest), seed=5)
-    table = read_cell(results, "table1", "vusfa-0").episodes["sampled"]
+    table = read_run(results, "table1", "vusfa-0").episodes["sampled"]
     with open(checkpoint.with_name("zero_shot_episodes.csv"), newline="") as file:
         assert list(csv.DictReader(file)) == [
             {key: str(int(value) if isinstance(value, bool) else value) for key, value in row.items()}

@@ -17,7 +17,7 @@ from omegaconf import OmegaConf
 from vusfa.conf import FOLDER as CONF
 from vusfa.evaluation import Episodes
 from vusfa.report import Options, read_run, write_report
-from vusfa.report.runs import Run
+from vusfa.report.runs import LoggedRun
 from vusfa.training.launch import compose
 
 RECIPES = Path(__file__).parents[2] / "recipes"
@@ -68,13 +68,13 @@ def run_folders(
 
 
 @pytest.fixture(scope="session")
-def runs(run_folders: list[Path]) -> list[Run]:
+def runs(run_folders: list[Path]) -> list[LoggedRun]:
     """Those runs, read."""
     return [read_run(folder) for folder in run_folders]
 
 
 @pytest.fixture(scope="session")
-def page(runs: list[Run], tmp_path_factory: pytest.TempPathFactory) -> Path:
+def page(runs: list[LoggedRun], tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Their page, with a title that is no HTML."""
     out = tmp_path_factory.mktemp("report") / "page.html"
     options = Options(title="A <b>title</b> & </script>", goals_per_scene=8, walks=2, max_steps=30)
@@ -83,12 +83,12 @@ def page(runs: list[Run], tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def corridor_run() -> Callable[..., Run]:
+def corridor_run() -> Callable[..., LoggedRun]:
     """A run with episodes: rows of goal, start, success, length, shortest, collisions, trained."""
 
     def made(
         label: str, seed: int, rows: list[tuple[int, ...]], scene: str = "hall", limit: int = 100
-    ) -> Run:
+    ) -> LoggedRun:
         goal, start, success, length, shortest, collisions, trained = torch.tensor(rows).T
         table = Episodes(
             torch.zeros_like(goal),
@@ -102,7 +102,9 @@ def corridor_run() -> Callable[..., Run]:
             (scene,),
             limit,
         )
-        return Run(label, seed, Path(f"{label}-{seed}"), {"agent": {"model": label}, "scenes": []}, {}, table)
+        return LoggedRun(
+            label, seed, Path(f"{label}-{seed}"), {"agent": {"model": label}, "scenes": []}, {}, table
+        )
 
     return made
 

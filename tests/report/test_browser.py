@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 
 from vusfa.report import Options, read_run, write_report
-from vusfa.report.runs import Run
+from vusfa.report.runs import LoggedRun
 from vusfa.scenes import Scene
 
 pytestmark = pytest.mark.browser
@@ -63,7 +63,7 @@ def colours(tab: Any, selector: str) -> list[str]:
     return tab.evaluate(f"[...document.querySelectorAll('{selector} path.s')].map((path) => path.style.fill)")
 
 
-def test_it_draws_all_its_parts(tab: Any, runs: list[Run]):
+def test_it_draws_all_its_parts(tab: Any, runs: list[LoggedRun]):
     assert tab.title() == "A <b>title</b> & </script>"
     assert tab.inner_text("h1") == "A <b>title</b> & </script>"
     for chart in ("overview", "distance-plot", "curves"):
@@ -112,7 +112,7 @@ def test_controls_change_the_charts(tab: Any, control: str, chart: str):
     assert points(tab, chart) != before
 
 
-def test_the_map_shows_success_by_goal(tab: Any, runs: list[Run]):
+def test_the_map_shows_success_by_goal(tab: Any, runs: list[LoggedRun]):
     tab.select_option("#map-measure", "success_20")
     shown = colours(tab, "#map-grid .map-row:nth-child(2)")[:176]  # gvf in the bathroom
     episodes = runs[2].episodes

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from vusfa.report.curves import band, learning_curves
-from vusfa.report.runs import Run
+from vusfa.report.runs import LoggedRun
 
 
 def test_a_curve_counts_between_its_ends_only():
@@ -30,10 +30,10 @@ def test_long_logs_are_thinned():
 
 
 def test_seeds_of_one_model_are_one_curve():
-    def run(label: str, seed: int, success: list[float]) -> Run:
+    def run(label: str, seed: int, success: list[float]) -> LoggedRun:
         log = {"frames": np.array([100.0, 200.0]), "seconds": np.array([60.0, 180.0 + 120 * seed])}
         log |= {"success": np.array(success), "scene/hall/success": np.array(success), "unknown": np.ones(2)}
-        return Run(label, seed, Path(), {}, log)
+        return LoggedRun(label, seed, Path(), {}, log)
 
     found = learning_curves([run("a", 0, [0.0, 1.0]), run("a", 1, [1.0, 1.0]), run("b", 0, [0.5, np.nan])])
     curves = {(curve["model"], curve["name"]): curve for curve in found}
@@ -46,4 +46,4 @@ def test_seeds_of_one_model_are_one_curve():
 
 
 def test_a_run_without_a_log_has_no_curve():
-    assert learning_curves([Run("a", 0, Path(), {})]) == []
+    assert learning_curves([LoggedRun("a", 0, Path(), {})]) == []

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import math
 
+import pandas as pd
 import pytest
 import torch
 
 from vusfa.evaluation import Episodes, summary
+from vusfa.evaluation.long_table import episode_rows, goal_sums
 from vusfa.evaluation.statistics import Sums, bootstrap_mean
-from vusfa.report.intervals import goal_sums, intervals
+from vusfa.report.intervals import intervals
 
 NAMES = ("success_9", "success_4", "spl", "length", "length_ratio", "collisions")
 
@@ -29,18 +31,22 @@ def table(seed: int, goals: int = 6, episodes: int = 4) -> Episodes:
     )
 
 
+def rows(episodes: Episodes) -> pd.DataFrame:
+    return episode_rows(episodes, "x", within=[4])
+
+
 @pytest.mark.parametrize("name", NAMES)
 @pytest.mark.parametrize("scene", ["hall", "attic", "mean of scenes"])
 def test_of_one_seed_they_are_about_the_summary(name: str, scene: str):
     (row,) = (r for r in summary(table(0), "x", [4]) if (r["goals"], r["scene"]) == ("all", scene))
-    found = intervals([table(0)], scene, [name])
+    found = intervals([rows(table(0))], scene, [name])
     assert found[f"{name}_from"] < row[name] < found[f"{name}_to"]
 
 
 @pytest.mark.parametrize("name", NAMES)
 def test_sums_make_the_summary(name: str):
     one = table(0)
-    found = goal_sums([one, table(1)], name)
+    found = goal_sums([rows(one), rows(table(1))], name)
     assert found is not None
     sums, scene = found
     assert sums.numerator.shape == (2, 12)
@@ -51,16 +57,17 @@ def test_sums_make_the_summary(name: str):
 
 
 def test_they_are_those_of_the_library():
-    sums = goal_sums([table(0), table(1)], "spl")
+    sums = goal_sums([rows(table(0)), rows(table(1))], "spl")
     assert sums is not None
     _, low, high = bootstrap_mean(*sums, by_scene=True)
-    assert intervals([table(0), table(1)], "mean of scenes", ["spl"]) == {"spl_from": low, "spl_to": high}
+    both = [rows(table(0)), rows(table(1))]
+    assert intervals(both, "mean of scenes", ["spl"]) == {"spl_from": low, "spl_to": high}
     _, low, high = bootstrap_mean(*sums)
-    assert intervals([table(0), table(1)], "mean of states", ["spl"]) == {"spl_from": low, "spl_to": high}
+    assert intervals(both, "mean of states", ["spl"]) == {"spl_from": low, "spl_to": high}
 
 
 def test_none_where_seeds_have_different_goals():
-    assert goal_sums([table(0), table(1, goals=5)], "spl") is None
+    assert goal_sums([rows(table(0)), rows(table(1, goals=5))], "spl") is None
     assert goal_sums([], "spl") is None
-    found = intervals([table(0), table(1, goals=5)], "hall", ["spl"])
+    found = intervals([rows(table(0)), rows(table(1, goals=5))], "hall", ["spl"])
     assert all(math.isnan(value) for value in found.values())

@@ -15,7 +15,7 @@ from vusfa.report import Options, write_report
 from vusfa.report.content import gather, goal_limit, open_scenes
 from vusfa.report.packing import unpack
 from vusfa.report.page import as_json
-from vusfa.report.runs import Run
+from vusfa.report.runs import LoggedRun
 from vusfa.scenes import Scene
 
 
@@ -40,7 +40,7 @@ def data_block(text: str) -> str:
     return text[text.index('id="data">') :]
 
 
-def test_what_it_holds(page: Path, runs: list[Run]):
+def test_what_it_holds(page: Path, runs: list[LoggedRun]):
     data = data_of(page)
     assert [model["label"] for model in data["models"]] == ["vusfa", "gvf"]
     assert [model["seeds"] for model in data["models"]] == [2, 1]
@@ -71,7 +71,7 @@ def test_the_tables_lie_beside_it(page: Path):
     assert (page.parent / "page_tables" / "goals.csv").read_text().count("\n") == 1 + 2 * 580
 
 
-def test_pictures_give_way_to_the_weight(runs: list[Run], tmp_path: Path):
+def test_pictures_give_way_to_the_weight(runs: list[LoggedRun], tmp_path: Path):
     (page, *_), _ = write_report(
         runs[:1], tmp_path / "deep" / "small.html", Options(megabytes=5.5, goals_per_scene=4, walks=1)
     )
@@ -81,7 +81,7 @@ def test_pictures_give_way_to_the_weight(runs: list[Run], tmp_path: Path):
     assert data_of(page)["goals_limit"] == 4
 
 
-def test_too_heavy_without_a_picture(runs: list[Run], tmp_path: Path):
+def test_too_heavy_without_a_picture(runs: list[LoggedRun], tmp_path: Path):
     with pytest.raises(ConfigError, match=r"more than megabytes=1; give fewer goals_per_scene"):
         write_report(runs[:1], tmp_path / "page.html", Options(megabytes=1, goals_per_scene=1))
     assert not list(tmp_path.iterdir())
@@ -93,7 +93,7 @@ def test_goals_are_fewer_where_the_page_would_be_too_heavy():
     assert goal_limit([10**9], 1, Options()) == 1
 
 
-def test_who_asks_for_too_many_goals_is_told(runs: list[Run]):
+def test_who_asks_for_too_many_goals_is_told(runs: list[LoggedRun]):
     lines: list[str] = []
     options = Options(goals_per_scene=99, megabytes=1, walks=1, max_steps=3, tell=lines.append)
     content, _ = gather(runs[:1], options)
@@ -102,12 +102,12 @@ def test_who_asks_for_too_many_goals_is_told(runs: list[Run]):
     assert "the explorer has 43 goals a scene, for the page's weight" in lines
 
 
-def test_every_seed_on_demand(runs: list[Run]):
+def test_every_seed_on_demand(runs: list[LoggedRun]):
     content, _ = gather(runs, Options(seeds=2, goals_per_scene=1, walks=1, max_steps=3))
     assert [agent["name"] for agent in content["agents"]] == ["vusfa, seed 0", "vusfa, seed 1", "gvf, seed 0"]
 
 
-def test_without_checkpoints_and_without_evaluation(runs: list[Run], tmp_path: Path):
+def test_without_checkpoints_and_without_evaluation(runs: list[LoggedRun], tmp_path: Path):
     bare = [dataclasses.replace(run, checkpoint=None, episodes=None, references=()) for run in runs]
     content, tables = gather(bare, Options())
     assert content["agents"] == []
@@ -128,7 +128,7 @@ def test_two_scenes_of_one_name(make_scene, tmp_path: Path):
     for width in (2, 3):
         scene: Scene = make_scene("hall", width, 2)
         scene.save(tmp_path / f"{width}.h5")
-        runs.append(Run("a", width, tmp_path / str(width), {"scenes": [str(tmp_path / f"{width}.h5")]}))
+        runs.append(LoggedRun("a", width, tmp_path / str(width), {"scenes": [str(tmp_path / f"{width}.h5")]}))
     with pytest.raises(ConfigError, match="different scenes called 'hall'"):
         open_scenes(runs)
 

@@ -13,9 +13,10 @@ import torch
 
 from vusfa.errors import ConfigError, ResultError
 from vusfa.evaluation.exact import ExactGoals
-from vusfa.experiments.results import Cell, write_cell
+from vusfa.experiments.runs import Run, write_run
 from vusfa.report import read_run, read_source
-from vusfa.report.runs import read_curves, read_episodes
+from vusfa.report.curve import read_metrics
+from vusfa.report.runs import read_episodes
 
 
 def test_a_run_of_the_recipe(run_folders: list[Path]):
@@ -62,7 +63,7 @@ def test_episodes_come_back_as_they_were_written(run_folders: list[Path], tmp_pa
 
 def test_curves_with_gaps(tmp_path: Path):
     (tmp_path / "metrics.csv").write_text("frames,success\n10,\n20,0.5\n")
-    curves = read_curves(tmp_path / "metrics.csv")
+    curves = read_metrics(tmp_path / "metrics.csv")
     np.testing.assert_array_equal(curves["success"], [np.nan, 0.5])
 
 
@@ -99,7 +100,10 @@ def results(run_folders: list[Path], tmp_path: Path) -> Path:
     exact = ExactGoals(
         (every >= 176).long(),
         torch.where(every < 176, every, every - 176),
-        *(torch.full((580,), x) for x in (0.25, 0.5, 0.1)),
+        {
+            name: torch.full((580,), x)
+            for name, x in (("success_100", 0.25), ("success_500", 0.5), ("spl", 0.1))
+        },
     )
     for seed in (0, 1):
         info = {
@@ -111,8 +115,8 @@ def results(run_folders: list[Path], tmp_path: Path) -> Path:
             "training_s": 60.0,
         }
         info |= {"checkpoint": "checkpoint-80.pt", "scenes": ["bathroom", "bedroom"]}
-        cell = Cell("table1", f"vusfa-{seed}", info, {"sampled": episodes, "greedy": episodes}, exact)
-        write_cell(tmp_path / "results", cell)
+        cell = Run("table1", f"vusfa-{seed}", info, {"sampled": episodes, "greedy": episodes}, exact)
+        write_run(tmp_path / "results", cell)
     shutil.copytree(run_folders[0], tmp_path / "runs" / "table1" / "vusfa-0")
     shutil.copy(
         run_folders[0] / "checkpoint.pt", tmp_path / "runs" / "table1" / "vusfa-0" / "checkpoint-80.pt"
@@ -130,13 +134,13 @@ def test_all_cells_of_an_experiment(results: Path):
     assert (second.frames, second.seconds) == (7, 60)
     assert second.scenes == ["bathroom", "bedroom"]
     assert first.exact is not None
-    assert first.exact.success_100[0] == 0.25
+    assert first.exact.metrics["success_100"][0] == 0.25
 
 
 def test_cells_in_the_papers_order_and_by_seed(results: Path):
     for name, model, seed in (("a", "sfdp", 10), ("b", "sfdp", 9), ("c", "gvf", 0), ("d", "random walk", 0)):
         info = {"model": model, "seed": seed, "scenes": ["bathroom"]}
-        write_cell(results.parent, Cell("table1", name, info, {}))
+        write_run(results.parent, Run("table1", name, info, {}))
     found = [(run.label, run.seed) for run in read_source(results)]
     assert found == [
         ("gvf", 0),

@@ -11,7 +11,7 @@ import torch
 
 from vusfa.evaluation.exact import ExactGoals
 from vusfa.report.by_goal import distance_rows, goal_rows
-from vusfa.report.runs import Run
+from vusfa.report.runs import LoggedRun
 from vusfa.report.tables import over_seeds, reference_rows, run_rows, seed_rows, summary_rows
 from vusfa.scenes import Scene, SceneSet
 
@@ -21,7 +21,7 @@ SECOND = [(0, 3, 1, 3, 3, 0, 1), (0, 2, 1, 4, 2, 0, 1), (4, 0, 0, 100, 4, 0, 0),
 
 
 @pytest.fixture
-def two_seeds(corridor_run) -> list[Run]:
+def two_seeds(corridor_run) -> list[LoggedRun]:
     return [corridor_run("a", 0, FIRST), corridor_run("a", 1, SECOND), corridor_run("b", 0, SECOND)]
 
 
@@ -32,7 +32,7 @@ def corridor() -> SceneSet:
     return SceneSet([Scene("hall", graph, torch.rand(6, 1, 2))])
 
 
-def test_the_summary_is_over_seeds(two_seeds: list[Run]):
+def test_the_summary_is_over_seeds(two_seeds: list[LoggedRun]):
     rows = {(row["model"], row["goals"]): row for row in summary_rows(two_seeds, within=[50])}
     assert list(rows) == [(m, g) for m in "ab" for g in ("trained", "unseen", "all")]
     trained = rows["a", "trained"]
@@ -52,7 +52,7 @@ def test_the_summary_is_over_seeds(two_seeds: list[Run]):
     assert math.isnan(rows["b", "unseen"]["length"])
 
 
-def test_seeds_stand_alone_in_their_own_table(two_seeds: list[Run]):
+def test_seeds_stand_alone_in_their_own_table(two_seeds: list[LoggedRun]):
     rows = [row for row in seed_rows(two_seeds) if row["goals"] == "trained"]
     assert [(row["model"], row["seed"], row["success_100"]) for row in rows] == [
         ("a", 0, 0.5),
@@ -61,7 +61,7 @@ def test_seeds_stand_alone_in_their_own_table(two_seeds: list[Run]):
     ]
 
 
-def test_what_runs_stand_beside(two_seeds: list[Run], corridor: SceneSet):
+def test_what_runs_stand_beside(two_seeds: list[LoggedRun], corridor: SceneSet):
     found = {(row["policy"], row["goals"]): row for row in reference_rows(two_seeds[0], corridor, [3])}
     assert found["shortest path", "all"]["success_100"] == 1
     # from 3 to 0 in three fair steps: 1/8, from 2 in three: 1/4, from 1: 1/2 + 1/8, from 4 and 5: 0
@@ -76,7 +76,7 @@ def test_what_runs_stand_beside(two_seeds: list[Run], corridor: SceneSet):
     assert math.isnan(kept["random walk"]["seeds"])
 
 
-def test_a_row_a_goal(two_seeds: list[Run]):
+def test_a_row_a_goal(two_seeds: list[LoggedRun]):
     rows = {(row["model"], row["goal"]): row for row in goal_rows(two_seeds, within=[50])}
     assert rows.keys() == {("a", 0), ("a", 4), ("b", 0), ("b", 4)}
     goal = rows["a", 4]
@@ -87,10 +87,11 @@ def test_a_row_a_goal(two_seeds: list[Run]):
     assert "exact_100" not in goal
 
 
-def test_exact_chances_where_all_seeds_have_them(two_seeds: list[Run]):
+def test_exact_chances_where_all_seeds_have_them(two_seeds: list[LoggedRun]):
     def exact(value: float) -> ExactGoals:
         zero = torch.zeros(2)
-        return ExactGoals(zero.long(), torch.tensor([0, 4]), zero + value, zero + 2 * value, zero)
+        metrics = {"success_100": zero + value, "success_500": zero + 2 * value, "spl": zero}
+        return ExactGoals(zero.long(), torch.tensor([0, 4]), metrics)
 
     first, second, third = two_seeds
     given = [
@@ -106,7 +107,7 @@ def test_exact_chances_where_all_seeds_have_them(two_seeds: list[Run]):
     assert "exact_100" not in rows["a", 4]
 
 
-def test_distance_from_the_nearest_trained_goal(two_seeds: list[Run], corridor: SceneSet):
+def test_distance_from_the_nearest_trained_goal(two_seeds: list[LoggedRun], corridor: SceneSet):
     rows = {(row["model"], row["distance"]): row for row in distance_rows(two_seeds, corridor, [50])}
     assert list(rows) == [("a", "0"), ("a", "3–4"), ("b", "0"), ("b", "3–4")]
     far = rows["a", "3–4"]
@@ -120,8 +121,8 @@ def test_missing_numbers_drop_out():
     assert math.isnan(rows["b"])
 
 
-def test_the_runs_themselves(two_seeds: list[Run]):
-    bare = Run("c", 9, Path("runs/x"), {"scenes": "hall"})
+def test_the_runs_themselves(two_seeds: list[LoggedRun]):
+    bare = LoggedRun("c", 9, Path("runs/x"), {"scenes": "hall"})
     row, *_, last = run_rows([*two_seeds, bare])
     assert (row["trained_success"], row["unseen_success"], row["evaluated"]) == (0.5, 1.0, "sampled")
     assert (last["folder"], last["evaluated"], last["scenes"]) == ("x", "no", "hall")

@@ -13,10 +13,10 @@ from torch import Tensor
 
 from vusfa.envs.goals import resolve_goals
 from vusfa.errors import ConfigError, GoalError
+from vusfa.evaluation.baselines import SHORTEST_PATH, shortest_paths
 from vusfa.evaluation.episodes import Episodes
-from vusfa.evaluation.floors import shortest_paths
 from vusfa.evaluation.navigation import Unreachable, episode_starts, evaluate
-from vusfa.evaluation.report import count_pairs, random_walk_summary, summary
+from vusfa.evaluation.summary import count_pairs, random_walk_summary, summary
 from vusfa.files import write_csv, write_json
 from vusfa.scenes import SceneSet
 
@@ -121,14 +121,14 @@ def compare(
     rows: list[dict[str, Any]] = []
     tables: list[Episodes] = []
     for name, policy in policies.items():
-        told = None if progress is None else _named(progress, name)
-        table = evaluate(policy, scenes, goal_ids, trained=trained, progress=told, **settings)
+        named_progress = None if progress is None else _named(progress, name)
+        table = evaluate(policy, scenes, goal_ids, trained=trained, progress=named_progress, **settings)
         rows += summary(table, name, within)
         tables.append(table)
     unreachable = settings.get("unreachable", "skip")
     limit = tables[0].max_steps
     rows += random_walk_summary(scenes, goal_ids, trained, limit, within, unreachable)
-    rows += summary(shortest_paths(tables[0]), "shortest path", within)
+    rows += summary(shortest_paths(tables[0]), SHORTEST_PATH, within)
     plain = {key: value for key, value in settings.items() if key not in ("observe", "episodes")}
     named = goals if isinstance(goals, str) and given is None else goal_ids.tolist()
     plain |= {"scenes": list(scenes.names), "goals": named}

@@ -1,106 +1,58 @@
-"""What a policy of one frame is worth, without drawing an episode.
+"""What a policy of one frame is worth, computed instead of sampled.
 
 Where an agent sees one frame and no more, its actions depend on the state and the goal alone: to each goal
-its walk is a Markov chain on the scene's graph. With p(a | s, g) its probabilities and s.a where a leads,
-
-    h_0(s) = 1 if s = g else 0,    h_k(s) = sum_a p(a | s, g) h_{k-1}(s.a),    h_k(g) = 1
-
-is the chance of having met g within k actions from s. SPL is the sum over k of (h_k - h_{k-1}) d / max(d, k)
-with d the shortest path (Anderson et al. 2018, eq. 1, in expectation).
+its walk is a Markov chain on the scene's graph (:mod:`vusfa.scenes.markov`). With h_k(s) the probability of
+having met the goal within k actions from s, h_k - h_{k-1} is that of an episode of k actions, and the
+expectation of a metric follows from the joint distribution of an episode's length and its shortest path.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, fields
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import islice, pairwise
 from typing import NamedTuple
 
+import numpy as np
 import torch
+from scipy import sparse
 from torch import Tensor
 
-from vusfa.modules import Agent, action_logits, frozen
+from vusfa.evaluation.episodes import Episodes
+from vusfa.evaluation.metrics import metrics_within
 from vusfa.scenes import SceneSet
+from vusfa.scenes.markov import arrival_by_step, goals_at_once
 
-__all__ = [
-    "ExactGoals",
-    "ExpectedWalks",
-    "agent_probabilities",
-    "exact_goals",
-    "expected_walks",
-    "reach_step",
-]
+__all__ = ["ExactGoals", "ExpectedWalks", "exact_goals", "expected_walks", "uniform_probabilities"]
 
+#: From ids of states, goals and scenes, (R,) each, to the probabilities (R, A) of the actions.
 Probabilities = Callable[[Tensor, Tensor, Tensor], Tensor]
 
 
 @dataclass(frozen=True, eq=False)
 class ExactGoals:
-    """One row a goal, means over all starts that it can be reached from; every column a tensor (G,).
+    """One row per goal, expectations over all starts that it can be reached from.
 
     Args:
-        scene: int64, index of the scene.
-        goal: int64, state id within its scene.
-        success_100, success_500: float64, chance of meeting it within so many actions.
-        spl: float64, of walks of at most 500 actions.
+        scene: (G,) int64, index of the scene.
+        goal: (G,) int64, state id within its scene.
+        metrics: by name, (G,) float64 each: ``success_500``, ``success_100``, ``spl``.
     """
 
     scene: Tensor
     goal: Tensor
-    success_100: Tensor
-    success_500: Tensor
-    spl: Tensor
+    metrics: Mapping[str, Tensor]
 
     def __post_init__(self) -> None:
-        shapes = {field.name: tuple(getattr(self, field.name).shape) for field in fields(self)}
+        columns = {"scene": self.scene, "goal": self.goal, **self.metrics}
+        shapes = {name: tuple(column.shape) for name, column in columns.items()}
         if len(set(shapes.values())) != 1 or self.scene.ndim != 1:
             raise ValueError(f"the columns of a table of goals must all be (G,); they are {shapes}")
 
 
-def reach_step(probability: Tensor, successor: Tensor, goal: Tensor, chance: Tensor) -> Tensor:
-    """h_k of h_{k-1}: chances (G, N) of having met each goal within one action more.
-
-    Args:
-        probability: (G, N, A), of actions on the way to each goal.
-        successor: (N, A) int64, where actions lead; a blocked one, to the state itself.
-        goal: (G,) int64.
-        chance: (G, N), before.
-
-    >>> corridor, fair = torch.tensor([[0, 1], [0, 2], [1, 2]]), torch.full((1, 3, 2), 0.5)
-    >>> goal, chance = torch.tensor([2]), torch.tensor([[0.0, 0.0, 1.0]])
-    >>> for _ in range(3):
-    ...     chance = reach_step(fair, corridor, goal, chance)
-    >>> chance
-    tensor([[0.3750, 0.6250, 1.0000]])
-    """
-    chance = (probability * chance[:, successor]).sum(-1)
-    chance[torch.arange(len(goal), device=goal.device), goal] = 1
-    return chance
-
-
-def agent_probabilities(agent: Agent, greedy: bool = False) -> Probabilities:
-    """The probabilities (R, A) of an agent's actions for ids of states, goals and scenes, (R,) each.
-
-    Args:
-        agent: one that sees one frame, by its id, and has no memory.
-        greedy: all on the likeliest action.
-
-    Raises:
-        ValueError: another agent, whose walk is no Markov chain on the graph.
-    """
-    config = agent.config
-    if config["history"] != 1 or config["observation"] != "index" or config["memory"] is not None:
-        raise ValueError(
-            "an exact evaluation needs an agent of one frame, without a memory, that reads ids; this one has"
-            f" history={config['history']}, observation={config['observation']}, memory={config['memory']}"
-        )
-
-    def probabilities(state: Tensor, goal: Tensor, scene: Tensor) -> Tensor:
-        logits = action_logits(agent, state.unsqueeze(-1), goal, scene)
-        if greedy:
-            return torch.nn.functional.one_hot(logits.argmax(-1), logits.shape[-1]).to(logits.dtype)
-        return logits.softmax(-1)
-
-    return probabilities
+def uniform_probabilities(num_actions: int) -> Probabilities:
+    """The random walk's :data:`Probabilities`."""
+    return lambda state, goal, scene: torch.full((len(state), num_actions), 1 / num_actions)
 
 
 class ExpectedWalks(NamedTuple):
@@ -109,7 +61,7 @@ class ExpectedWalks(NamedTuple):
 
     Attributes:
         length: actions; a walk that does not arrive counts with all K.
-        success: chance of arriving.
+        success: probability of arriving.
         arrived_length: actions of walks that arrive, the others counting 0.
         arrived_shortest: actions of the shortest path from where walks that arrive began, the others 0.
         shortest: actions of the shortest path.
@@ -131,14 +83,11 @@ class ExpectedWalks(NamedTuple):
 def expected_walks(
     probabilities: Probabilities | None, scenes: SceneSet, goals: Tensor, max_steps: int = 500
 ) -> ExpectedWalks:
-    r"""What walks to some goals come to in expectation; computed, not sampled. With T the actions until
-    arrival, K ``max_steps`` and h_k the chance of having arrived within k,
-
-    .. math:: E[\min(T, K)] = \sum_{k=0}^{K-1} (1 - h_k), \quad
-              E[T; T \le K] = \sum_{k=1}^{K} k (h_k - h_{k-1})
+    r"""What walks to some goals come to in expectation, with T the actions until arrival and K ``max_steps``:
+    E[min(T, K)], P(T <= K), E[T; T <= K].
 
     Args:
-        probabilities: of actions, see :func:`agent_probabilities`; None for a random walk.
+        probabilities: of actions; None for a random walk.
         scenes: the world.
         goals: (G,) global ids, scene by scene.
         max_steps: K.
@@ -147,95 +96,102 @@ def expected_walks(
     >>> 500 > walks.length.mean().item() > 10 * walks.shortest.mean().item() > 10
     True
     """
+    probabilities = probabilities or uniform_probabilities(scenes.num_actions)
     parts = []
-    for index in range(len(scenes.scenes)):
+    for index in range(scenes.num_scenes):
         here = goals[scenes.scene_id[goals] == index] - int(scenes.offsets[index])
-        chain = _chain(probabilities, scenes, index, here)
-        chance, shortest = chain.arrived, chain.shortest
-        length, arrived = torch.zeros_like(chance), torch.zeros_like(chance)
-        for k in range(1, max_steps + 1):
-            length += 1 - chance
-            before, chance = chance, reach_step(chain.acts, chain.successor, here, chance)
-            arrived += k * (chance - before)
-        columns = (length, chance, arrived, chance * shortest, shortest.double())
-        parts.append([chain.mean(column) for column in columns])
+        for _, chance, shortest in _distributions(probabilities, scenes, index, here, max_steps):
+            steps = torch.arange(chance.shape[1], dtype=torch.float64)[:, None]
+            ways = torch.arange(chance.shape[2], dtype=torch.float64)
+            success = chance.sum((1, 2))
+            arrived = (chance * steps).sum((1, 2))
+            length = arrived + max_steps * (1 - success)
+            parts.append((length, success, arrived, (chance * ways).sum((1, 2)), shortest))
     return ExpectedWalks(*(torch.cat(column) for column in zip(*parts, strict=True)))
 
 
 @torch.no_grad()
 def exact_goals(
-    probabilities: Probabilities, scenes: SceneSet, agent: Agent | None = None, *, at_once: int = 64
+    probabilities: Probabilities,
+    scenes: SceneSet,
+    *,
+    within: Sequence[int] = (500, 100),
+    max_steps: int = 500,
+    at_once: int | None = None,
 ) -> ExactGoals:
     """Every state of every scene as a goal, from every start that it can be reached from.
 
     Args:
-        probabilities: of actions, see :func:`agent_probabilities`.
+        probabilities: of actions; those of an agent of one frame are its
+            :meth:`TabularPolicy.probabilities`.
         scenes: the world.
-        agent: what ``probabilities`` come from: then it encodes the world once.
-        at_once: goals that are computed together.
+        within: numbers of actions to give the success within.
+        max_steps: actions allowed in a walk.
+        at_once: goals that are computed together; what suits the processor when not given.
 
     >>> rooms = SceneSet.bundled(["bathroom"])
-    >>> exact_goals(lambda state, goal, scene: torch.full((len(state), 4), 0.25), rooms).success_500.shape
+    >>> exact_goals(uniform_probabilities(4), rooms).metrics["success_500"].shape
     torch.Size([176])
     """
+    metrics = [metric for metric in metrics_within(within, max_steps) if metric.exact]
     rows = []
-    with frozen(agent if agent is not None else torch.nn.Module()):
-        for index, scene in enumerate(scenes.scenes):
-            for goals in torch.arange(scene.num_states).split(at_once):
-                rows.append(_some_goals(probabilities, scenes, index, goals))
-    return ExactGoals(*(torch.cat(column) for column in zip(*rows, strict=True)))
+    for index, scene in enumerate(scenes.scenes):
+        longest = int(scene.distance.max())
+        weights = _outcomes(longest, max_steps)
+        scores = torch.stack([_score(metric.parts(weights)) for metric in metrics])
+        scores = scores.view(len(metrics), max_steps + 1, longest + 1)
+        every = torch.arange(scene.num_states)
+        for goals, chance, shortest in _distributions(
+            probabilities, scenes, index, every, max_steps, at_once
+        ):
+            values = torch.einsum("gkd,mkd->mg", chance, scores)
+            kept = ~shortest.isnan()
+            rows.append([column[kept] for column in (torch.full_like(goals, index), goals, *values)])
+    scene_id, goal, *columns = (torch.cat(column) for column in zip(*rows, strict=True))
+    return ExactGoals(scene_id, goal, {m.name: column for m, column in zip(metrics, columns, strict=True)})
 
 
-def _some_goals(
-    probabilities: Probabilities, scenes: SceneSet, index: int, goals: Tensor
-) -> tuple[Tensor, ...]:
-    chain = _chain(probabilities, scenes, index, goals)
-    before, shortest = chain.arrived, chain.shortest
-    reached, spl = {}, torch.zeros_like(before)
-    for k in range(1, 501):
-        now = reach_step(chain.acts, chain.successor, goals, before)
-        spl += (now - before) * shortest / shortest.clamp(min=k)
-        before = now
-        if k in (100, 500):
-            reached[k] = now
-    kept = (shortest > 0).any(1)
-    means = [chain.mean(values) for values in (reached[100], reached[500], spl)]
-    columns = torch.full_like(goals, index), goals, *means
-    return tuple(column[kept] for column in columns)
+def _score(parts: tuple[Tensor, Tensor] | None) -> Tensor:
+    assert parts is not None, "an exact metric reads success, length and shortest alone"
+    return parts[0].to(torch.float64).nan_to_num()  # 0 / 0 where an episode begins at its goal: there is none
 
 
-class _Chain(NamedTuple):
-    """Walks in one scene to G of its goals.
-
-    Attributes:
-        acts: (G, n, A) float64, chances of the actions.
-        successor: (n, A), where they lead.
-        arrived: (G, n) float64, chance of having arrived before the first of them.
-        shortest: (G, n), actions of the shortest walk; -1 where there is none.
-    """
-
-    acts: Tensor
-    successor: Tensor
-    arrived: Tensor
-    shortest: Tensor
-
-    def mean(self, values: Tensor) -> Tensor:
-        """(G, n) to (G,): over the starts that can reach the goal in more than 0 actions."""
-        counted = self.shortest > 0
-        return (values * counted).sum(1) / counted.sum(1)
+def _outcomes(longest: int, max_steps: int) -> Episodes:
+    """A successful episode of each length 0 to ``max_steps`` and each shortest path 0 to ``longest``."""
+    length = torch.arange(max_steps + 1).repeat_interleave(longest + 1)
+    shortest = torch.arange(longest + 1).repeat(max_steps + 1)
+    none, yes = torch.zeros_like(length), torch.ones_like(length, dtype=torch.bool)
+    return Episodes(none, none, none, yes, length, shortest, none, ~yes, ("",), max_steps)
 
 
-def _chain(probabilities: Probabilities | None, scenes: SceneSet, index: int, goals: Tensor) -> _Chain:
+def _distributions(
+    probabilities: Probabilities,
+    scenes: SceneSet,
+    index: int,
+    goals: Tensor,
+    max_steps: int,
+    at_once: int | None = None,
+) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
+    """Of a scene's goals, in blocks: ids (g,); the probability (g, K + 1, D) that an episode arrives with its
+    k-th action and its shortest path has d; the mean shortest path (g,), NaN for a goal that no start
+    reaches."""
     scene, first = scenes.scenes[index], int(scenes.offsets[index])
-    size = scene.num_states
-    successor = scenes.successor[first : first + size] - first
-    if probabilities is None:
-        acts = torch.full((len(goals), *successor.shape), 1 / successor.shape[1], dtype=torch.float64)
-    else:
-        state = torch.arange(size).repeat(len(goals)) + first
-        goal = goals.repeat_interleave(size) + first
-        told = probabilities(state, goal, torch.full_like(state, index))
-        acts = told.view(len(goals), *successor.shape).double()
-    arrived = torch.zeros(len(goals), size, dtype=torch.float64)
-    arrived[torch.arange(len(goals)), goals] = 1
-    return _Chain(acts, successor, arrived, scene.distance[:, goals].T)
+    size, longest = scene.num_states, int(scene.distance.max())
+    for block in goals.split(at_once or goals_at_once(size)) if len(goals) else ():
+        count = len(block)
+        state = torch.arange(size).repeat(count) + first
+        goal = block.repeat_interleave(size) + first
+        acts = probabilities(state, goal, torch.full_like(state, index)).view(count, size, -1)
+        shortest = scene.distance[:, block].T.to(torch.int64)
+        starts = shortest > 0
+        # Starts of one goal that are equally far are summed: one sparse product per action.
+        bins = torch.arange(count)[:, None] * (longest + 1) + shortest.clamp(min=0)
+        place = starts.flatten().nonzero().squeeze(1)
+        entries = np.ones(len(place)), (bins.flatten()[place].numpy(), place.numpy())
+        binned = sparse.csr_matrix(entries, shape=(count * (longest + 1), count * size))
+        chance = torch.zeros(count, max_steps + 1, longest + 1, dtype=torch.float64)
+        walks = islice(arrival_by_step(scene.graph, acts, block), max_steps + 1)
+        for k, (before, now) in enumerate(pairwise(walks), 1):
+            chance[:, k] = torch.from_numpy(binned @ (now - before).flatten().numpy()).view(count, -1)
+        number = starts.sum(1)
+        yield block, chance / number[:, None, None], (shortest * starts).sum(1) / number.double()

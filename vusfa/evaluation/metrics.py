@@ -1,119 +1,220 @@
-"""What a set of episodes amounts to: success, SPL, detour, collisions. Pure functions of tensors, one row an
-episode.
+"""The registry of metrics: what a set of episodes amounts to.
 
-The measures and their sources:
+A metric is one registered function from :class:`~vusfa.evaluation.episodes.Episodes` to a numerator and a
+denominator per episode; over any set of episodes its value is the sum of the numerators over the sum of the
+denominators. A mean has ones for denominators. Every table, interval, CSV file and the report's page read the
+registry, so a new metric is one function:
 
-- success within k steps: the agent stood on the goal after at most k actions.
-- SPL, success weighted by path length (Anderson et al. 2018, arXiv 1807.06757, eq. 1), counted in actions
-  instead of metres: the mean over episodes of ``success * shortest / max(length, shortest)``.
-- soft-SPL (Datta et al. 2020, arXiv 2009.03231, sec. 4): success is replaced by the share of the way to the
-  goal that is behind the agent when the episode ends, ``max(0, 1 - remaining / shortest)``.
-- length over shortest path: mean length of the successful episodes over the mean of their shortest paths. A
-  ratio of means, not a mean of ratios: in the latter an episode that starts beside its goal weighs as much as
-  a long one.
+>>> @register_metric("collision_rate", label="collisions per action", digits=2, higher_is_better=False)
+... def collision_rate(episodes):
+...     return episodes.collisions, episodes.length
+>>> METRICS.pop("collision_rate").label
+'collisions per action'
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
-__all__ = [
-    "length_ratio",
-    "soft_spl",
-    "soft_spl_scores",
-    "spl",
-    "spl_scores",
-    "success_rate",
-    "weighted_mean",
-]
+from vusfa.errors import ConfigError
+from vusfa.evaluation.episodes import Episodes
+
+__all__ = ["METRICS", "Metric", "get_metric", "metrics_within", "register_metric", "success_within"]
+
+Parts = Callable[[Episodes], tuple[Tensor, Tensor] | None]
 
 
-def success_rate(success: Tensor, length: Tensor, within: int) -> float:
-    """Share of the episodes that met their goal after at most ``within`` actions, NaN without episodes.
+@dataclass(frozen=True)
+class Metric:
+    """One metric and how it is shown.
+
+    Attributes:
+        name: the column's name.
+        parts: numerator and denominator, (n,) each, of n episodes; None where they lack a column.
+        label: head of a table's column.
+        short: the same for a terminal of 80 characters.
+        title: one line for a chart's axis.
+        unit: ``%`` for shares, which are kept as fractions and printed times 100; or empty.
+        digits: decimals to print.
+        higher_is_better: the direction of improvement.
+        exact: it reads success, length and shortest alone and its denominators are ones, so that
+            :func:`~vusfa.evaluation.exact.exact_goals` can compute its expectation.
+    """
+
+    name: str
+    parts: Parts
+    label: str
+    short: str
+    title: str = ""
+    unit: str = ""
+    digits: int = 1
+    higher_is_better: bool = True
+    exact: bool = False
+
+    @property
+    def scale(self) -> float:
+        """What a value is multiplied by to be printed."""
+        return 100.0 if self.unit == "%" else 1.0
+
+    @property
+    def heading(self) -> str:
+        """The label with its unit."""
+        return f"{self.label}, {self.unit}" if self.unit else self.label
+
+    def text(self, value: float) -> str:
+        """A value as tables print it, without its unit.
+
+        >>> METRICS["spl"].text(0.4567), METRICS["spl"].text(math.nan)
+        ('45.7', '–')
+        """
+        return "–" if math.isnan(value) else f"{self.scale * value:.{self.digits}f}"
+
+    def value(self, episodes: Episodes) -> float:
+        """Numerators over denominators; NaN without episodes, or where the metric is not defined."""
+        parts = self.parts(episodes)
+        if parts is None:
+            return math.nan
+        over, under = (part.to(torch.float64).sum().item() for part in parts)
+        return over / under if under else math.nan
+
+
+#: Registered metrics by name, in the order in which tables show them, after success.
+METRICS: dict[str, Metric] = {}
+
+
+def register_metric(
+    name: str,
+    *,
+    label: str,
+    short: str = "",
+    title: str = "",
+    unit: str = "",
+    digits: int = 1,
+    higher_is_better: bool = True,
+    exact: bool = False,
+) -> Callable[[Parts], Parts]:
+    """Register a function as a metric; see :class:`Metric` for the arguments; ``short`` and
+    ``title`` are the label where they are not given.
+
+    Raises:
+        ConfigError: a name that is taken.
+    """
+    if name in METRICS or name.startswith("success_"):
+        raise ConfigError(f"a metric called {name!r} is registered already; give another name")
+
+    def register(parts: Parts) -> Parts:
+        words = label, short or label, title or label
+        METRICS[name] = Metric(name, parts, *words, unit, digits, higher_is_better, exact)
+        return parts
+
+    return register
+
+
+def success_within(limit: int) -> Metric:
+    """``success_LIMIT``: the share of episodes that met their goal after at most ``limit`` actions.
+
+    >>> success_within(100).heading
+    'success in 100, %'
+    """
+    return Metric(
+        f"success_{limit}",
+        lambda episodes: (episodes.success & (episodes.length <= limit), torch.ones_like(episodes.length)),
+        f"success in {limit}",
+        f"@{limit}",
+        f"Goals reached within {limit} actions",
+        "%",
+        exact=True,
+    )
+
+
+def get_metric(name: str) -> Metric:
+    """The metric of a column's name.
+
+    Raises:
+        ConfigError: there is none.
+
+    >>> get_metric("success_100").name, get_metric("spl").label
+    ('success_100', 'SPL')
+    """
+    limit = name.removeprefix("success_")
+    if limit != name and limit.isdigit():
+        return success_within(int(limit))
+    if name not in METRICS:
+        raise ConfigError(f"metric {name!r}: unknown; give success_N or one of {', '.join(METRICS)}")
+    return METRICS[name]
+
+
+def metrics_within(within: Sequence[int], max_steps: int) -> list[Metric]:
+    """Success within each number of actions, the largest first, then all registered metrics.
 
     Args:
-        success: (n,) bool, the goal was met.
-        length: (n,) actions taken.
-        within: actions allowed.
+        within: numbers of actions; those above ``max_steps`` are left out.
+        max_steps: of the episodes; always among the numbers.
 
-    >>> success_rate(torch.tensor([True, True, False]), torch.tensor([3, 80, 100]), within=50)
-    0.3333333333333333
+    >>> [metric.name for metric in metrics_within([1000, 20], 500)][:3]
+    ['success_500', 'success_20', 'spl']
     """
-    return (success & (length <= within)).to(torch.float64).mean().item()
+    limits = sorted({max_steps, *(limit for limit in within if limit < max_steps)}, reverse=True)
+    return [*(success_within(limit) for limit in limits), *METRICS.values()]
 
 
-def spl(success: Tensor, length: Tensor, shortest: Tensor) -> float:
-    """Success weighted by path length, in actions (Anderson et al. 2018, eq. 1), NaN without episodes.
-
-    Args:
-        success: (n,) bool, the goal was met.
-        length: (n,) actions taken.
-        shortest: (n,) fewest actions possible, -1 where there is no path (such an episode has failed).
-
-    >>> spl(torch.tensor([True, True, False]), torch.tensor([4, 8, 99]), torch.tensor([4, 4, 4]))
-    0.5
+@register_metric("spl", label="SPL", title="SPL: success weighted by path length", unit="%", exact=True)
+def spl(episodes: Episodes) -> tuple[Tensor, Tensor]:
+    """Success weighted by path length, ``success * shortest / max(length, shortest)``, in actions instead of
+    meters (Anderson et al. 2018, arXiv 1807.06757, eq. 1).
     """
-    return spl_scores(success, length, shortest).mean().item()
+    best = episodes.shortest.to(torch.float64)
+    scores = torch.where(episodes.success, best / torch.maximum(episodes.length.to(torch.float64), best), 0.0)
+    return scores, torch.ones_like(scores)
 
 
-def spl_scores(success: Tensor, length: Tensor, shortest: Tensor) -> Tensor:
-    """:func:`spl` of each episode, (n,) float64.
-
-    >>> spl_scores(torch.tensor([True, True, False]), torch.tensor([4, 8, 99]), torch.tensor([4, 4, 4]))
-    tensor([1.0000, 0.5000, 0.0000], dtype=torch.float64)
+@register_metric("soft_spl", label="soft-SPL", short="soft", title="soft-SPL: SPL of the progress", unit="%")
+def soft_spl(episodes: Episodes) -> tuple[Tensor, Tensor] | None:
+    """SPL with progress instead of success: the share of the way to the goal that is behind the agent when
+    the episode ends, ``max(0, 1 - remaining / shortest)`` (Datta et al. 2020, arXiv 2009.03231, sec. 4).
     """
-    best = shortest.to(torch.float64)
-    return torch.where(success, best / torch.maximum(length.to(torch.float64), best), 0.0)
+    if episodes.remaining is None:
+        return None
+    best = episodes.shortest.to(torch.float64)
+    progress = (1 - episodes.remaining / best.clamp(min=1)).clamp(min=0)
+    scores = progress * best / torch.maximum(episodes.length.to(torch.float64), best)
+    scores = torch.where((best > 0) & (episodes.remaining >= 0), scores, 0.0)
+    return scores, torch.ones_like(scores)
 
 
-def soft_spl(length: Tensor, shortest: Tensor, remaining: Tensor) -> float:
-    """SPL with progress instead of success (Datta et al. 2020), in actions, NaN without episodes.
+@register_metric(
+    "length",
+    label="length",
+    short="steps",
+    title="Length of successful episodes (actions)",
+    digits=2,
+    higher_is_better=False,
+)
+def length(episodes: Episodes) -> tuple[Tensor, Tensor]:
+    """Actions of the successful episodes."""
+    return episodes.success * episodes.length, episodes.success
 
-    Args:
-        length: (n,) actions taken.
-        shortest: (n,) fewest actions possible, -1 where there is no path (such an episode counts 0).
-        remaining: (n,) fewest actions from where it ended to the goal, -1 where no path is left.
 
-    >>> soft_spl(torch.tensor([8, 8, 8]), torch.tensor([4, 4, 4]), torch.tensor([0, 1, 7]))
-    0.2916666666666667
+@register_metric("length_ratio", label="length / shortest", short="ratio", digits=2, higher_is_better=False)
+def length_ratio(episodes: Episodes) -> tuple[Tensor, Tensor]:
+    """Length of the successful episodes over that of their shortest paths: a ratio of means, not a mean of
+    ratios, in which an episode that starts beside its goal would weigh as much as a long one.
     """
-    return soft_spl_scores(length, shortest, remaining).mean().item()
+    return episodes.success * episodes.length, episodes.success * episodes.shortest
 
 
-def soft_spl_scores(length: Tensor, shortest: Tensor, remaining: Tensor) -> Tensor:
-    """:func:`soft_spl` of each episode, (n,) float64.
-
-    >>> soft_spl_scores(torch.tensor([8, 8]), torch.tensor([4, 4]), torch.tensor([0, 1]))
-    tensor([0.5000, 0.3750], dtype=torch.float64)
-    """
-    best = shortest.to(torch.float64)
-    progress = (1 - remaining / best.clamp(min=1)).clamp(min=0)
-    scores = progress * best / torch.maximum(length.to(torch.float64), best)
-    return torch.where((best > 0) & (remaining >= 0), scores, 0.0)
-
-
-def length_ratio(success: Tensor, length: Tensor, shortest: Tensor) -> float:
-    """Mean length of the successful episodes over the mean of their shortest paths, NaN when none succeeded.
-
-    >>> length_ratio(torch.tensor([True, True, False]), torch.tensor([4, 8, 99]), torch.tensor([4, 4, 4]))
-    1.5
-    """
-    taken = length[success].sum().item()
-    best = shortest[success].sum().item()
-    return taken / best if best else math.nan
-
-
-def weighted_mean(values: Sequence[float], weights: Sequence[float]) -> float:
-    """Mean of ``values`` weighted by ``weights``; a NaN value drops out with its weight, NaN when nothing is
-    left.
-
-    >>> weighted_mean([1.0, 0.5, math.nan], [1, 3, 9])
-    0.625
-    """
-    kept = [(v, w) for v, w in zip(values, weights, strict=True) if not math.isnan(v)]
-    total = sum(w for _, w in kept)
-    return sum(v * w for v, w in kept) / total if total else math.nan
+@register_metric(
+    "collisions",
+    label="collisions",
+    short="bumps",
+    title="Blocked actions per episode",
+    higher_is_better=False,
+)
+def collisions(episodes: Episodes) -> tuple[Tensor, Tensor]:
+    """Actions that were blocked, per episode."""
+    return episodes.collisions, torch.ones_like(episodes.collisions)

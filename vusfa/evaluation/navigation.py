@@ -1,4 +1,4 @@
-"""Walks many episodes at once and writes down how each of them ended.
+"""Batched rollouts of episodes, and the table of how each of them ended.
 
 The rules are the environment's own (:mod:`vusfa.envs.dynamics`), on a batch that shrinks: an episode that
 ends leaves it at once and one that waits takes the row, so that the few long episodes at the end cost what
@@ -24,7 +24,7 @@ from vusfa.evaluation.episodes import Episodes
 from vusfa.modules import frozen
 from vusfa.scenes import SceneSet
 
-__all__ = ["Unreachable", "episode_starts", "evaluate", "walk"]
+__all__ = ["Unreachable", "episode_starts", "evaluate", "trails", "walk"]
 
 Unreachable = Literal["skip", "fail"]
 Observe = Callable[[TensorDictBase], TensorDictBase]
@@ -107,7 +107,7 @@ def evaluate(
     observe: Observe | None = None,
     progress: Progress | None = None,
 ) -> Episodes:
-    """Walks ``episodes_per_goal`` episodes to every goal and returns the table of them.
+    """Roll out ``episodes_per_goal`` episodes to every goal.
 
     The draws come from ``seed`` alone and the caller's random state is left as it was, so an evaluation in
     the middle of a training does not change the training. The policy is put in evaluation mode meanwhile
@@ -144,15 +144,7 @@ def evaluate(
             unreachable=unreachable,
             generator=generator,
         )
-    devices = [scenes.successor.device] if scenes.successor.device.type == "cuda" else []
-    exploration = ExplorationType.RANDOM if sample else ExplorationType.DETERMINISTIC
-    with (
-        torch.random.fork_rng(devices),
-        _in_evaluation_mode(policy),
-        set_exploration_type(exploration),
-        frozen(policy),
-    ):
-        torch.manual_seed(seed)
+    with _acting(policy, scenes, sample, seed):
         success, length, collisions, end = walk(
             policy,
             scenes,
@@ -194,8 +186,9 @@ def walk(
     batch_size: int = 4096,
     observe: Observe | None = None,
     progress: Progress | None = None,
+    visited: list[tuple[Tensor, Tensor]] | None = None,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Walks one episode from every start to its goal, in the exploration mode and from the random state in
+    """Walk one episode from every start to its goal, in the exploration mode and from the random state in
     force.
 
     A policy with memory writes its next state under ``("next", key)``; it finds it again under ``key``, and
@@ -205,6 +198,7 @@ def walk(
         policy, scenes, max_steps, history, batch_size, observe, progress: see :func:`evaluate`.
         start: (n,) global state ids.
         goal: (n,) global state ids.
+        visited: gets, per step of the batch, the episodes that moved and the states that they came to.
 
     Returns:
         success (n,) bool, length (n,) int64, collisions (n,) int64 and the state (n,) int64 where each ended,
@@ -253,6 +247,8 @@ def walk(
         success[row] = end.terminated.squeeze(-1)
         length[row] = steps.squeeze(-1)
         last[row] = frames[:, -1]
+        if visited is not None:
+            visited.append((row, last[row]))
         collisions.index_add_(0, row, end.collided.squeeze(-1).to(torch.int64))
         memory = {key: batch.get(("next", *key)) for key in memory_keys}
 
@@ -272,13 +268,64 @@ def walk(
     return success.cpu(), length.cpu(), collisions.cpu(), last.cpu()
 
 
+def trails(
+    policy: TensorDictModuleBase,
+    scenes: SceneSet,
+    start: Tensor,
+    goal: Tensor,
+    *,
+    max_steps: int = 500,
+    history: int = 4,
+    seed: int = 0,
+    observe: Observe | None = None,
+) -> list[list[int]]:
+    """The ways of episodes with sampled actions, one from every start.
+
+    Args:
+        policy, scenes, max_steps, history, seed, observe: see :func:`evaluate`.
+        start, goal: (n,) global state ids.
+
+    Returns:
+        n lists of global state ids, the start first; one that arrived ends with its goal.
+
+    >>> from vusfa.modules import make_agent
+    >>> rooms = SceneSet.bundled(["bathroom"])
+    >>> actor = make_agent("gvf", scenes=rooms, hidden_size=16).get_policy_operator()
+    >>> (way,) = trails(actor, rooms, torch.tensor([5]), torch.tensor([9]), max_steps=7)
+    >>> way[0], len(way) <= 8
+    (5, True)
+    """
+    visited: list[tuple[Tensor, Tensor]] = []
+    with _acting(policy, scenes, True, seed):
+        walk(
+            policy,
+            scenes,
+            start,
+            goal,
+            max_steps=max_steps,
+            history=history,
+            observe=observe,
+            visited=visited,
+        )
+    ways = [[state] for state in start.tolist()]
+    for rows, states in visited:
+        for row, state in zip(rows.tolist(), states.tolist(), strict=True):
+            ways[row].append(state)
+    return ways
+
+
 @contextmanager
-def _in_evaluation_mode(policy: nn.Module) -> Iterator[None]:
-    """Evaluation mode for every submodule, and afterwards each back in the mode it was in."""
+def _acting(policy: nn.Module, scenes: SceneSet, sample: bool, seed: int) -> Iterator[None]:
+    """Evaluation mode for every submodule, and afterwards each back in the mode it was in; cached encodings;
+    a random state of its own."""
     modes = [(module, module.training) for module in policy.modules()]
     policy.eval()
+    devices = [scenes.device] if scenes.device.type == "cuda" else []
+    exploration = ExplorationType.RANDOM if sample else ExplorationType.DETERMINISTIC
     try:
-        yield
+        with torch.random.fork_rng(devices), set_exploration_type(exploration), frozen(policy):
+            torch.manual_seed(seed)
+            yield
     finally:
         for module, mode in modes:
             module.training = mode

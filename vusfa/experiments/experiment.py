@@ -1,232 +1,133 @@
-"""Cells of results side by side: who walked the same episodes, as sums per seed and goal."""
+"""Runs side by side that walked the same episodes, as one long table."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
+import pandas as pd
 import torch
 from torch import Tensor
 
 from vusfa.errors import ResultError
-from vusfa.evaluation.episodes import Episodes
-from vusfa.evaluation.exact import ExactGoals, exact_goals
-from vusfa.evaluation.floors import shortest_paths
-from vusfa.evaluation.metrics import soft_spl_scores, spl_scores
+from vusfa.evaluation.baselines import RANDOM_WALK, SHORTEST_PATH, shortest_paths
+from vusfa.evaluation.exact import exact_goals, uniform_probabilities
+from vusfa.evaluation.long_table import distance_to_trained, episode_rows, exact_rows, join_tables
 from vusfa.evaluation.statistics import Sums
-from vusfa.experiments.results import Cell, read_cells
+from vusfa.experiments.runs import Run, read_runs
 from vusfa.modules.presets import MODELS
 from vusfa.scenes import SceneSet
 
-__all__ = ["Experiment", "episode_sums", "nearest_trained", "read_experiment", "row_label"]
+__all__ = ["Experiment", "read_experiment"]
 
-RANDOM_WALK, SHORTEST_PATH = "random walk", "shortest path"
 _FIRST = ("untrained", *MODELS)
 
 
 @dataclass(frozen=True, eq=False)
 class Experiment:
-    """Models whose cells hold the same episodes.
+    """Models whose runs hold the same episodes.
 
     Attributes:
-        cells: by what a model is called, in order of seed.
+        runs: by model's label, in order of seed.
         scenes: the world.
+        table: the long table of all runs and of the baselines, whose mode is ``exact``.
         scene, goal: (G,) int64, the goals: index of the scene, state id within it.
         trained: (G,) bool, trained on.
-        away: (G,) int64, actions from the nearest trained goal, -1 where there is none.
-        place: (n,) int64, the goal (index) of each episode.
-        floor: the random walk, goal by goal, computed.
+        distance_to_trained: (G,) int64, actions from the nearest trained goal, -1 where there is none.
     """
 
-    cells: Mapping[str, Sequence[Cell]]
+    runs: Mapping[str, Sequence[Run]]
     scenes: SceneSet
+    table: pd.DataFrame
     scene: Tensor
     goal: Tensor
     trained: Tensor
-    away: Tensor
-    place: Tensor
-    floor: ExactGoals
+    distance_to_trained: Tensor
+
+    def __post_init__(self) -> None:
+        by = ["model", "mode", "metric"]
+        groups = {key: part for key, part in self.table.groupby(by, observed=True, sort=True)}
+        object.__setattr__(self, "_groups", groups)
 
     def seeds(self, label: str) -> list[int]:
-        """Seeds of a model's cells, in order."""
-        return [int(cell.info["seed"]) for cell in self.cells[label]]
+        """Seeds of a model's runs, in order."""
+        return [run.seed for run in self.runs[label]]
 
-    def sums(self, label: str, way: str, seeds: Sequence[int] | None = None) -> dict[str, Sums]:
-        """What a model's means are made of, measure by measure, (K, G) each.
+    def sums(self, label: str, mode: str, seeds: Sequence[int] | None = None) -> dict[str, Sums]:
+        """Numerators and denominators of a model's metrics per seed and goal, (K, G) each.
 
         Args:
-            label: of a model, or ``random walk`` (computed) or ``shortest path``: one row, for they have no
-                seeds.
-            way: of evaluation: ``sampled``, ``greedy``, or ``exact`` where the cells have it; empty for cells
-                that were not evaluated so.
-            seeds: those to take; all when not given. The floor and the ceiling repeat their row.
+            label: of a model or of a baseline, which has one row, in any mode.
+            mode: ``sampled``, ``greedy``, or ``exact`` where the runs have it; empty for runs that were not
+                evaluated in it.
+            seeds: those to take; all when not given. The baselines repeat their row.
         """
-        if label in (RANDOM_WALK, SHORTEST_PATH):
-            found = self._exact(self.floor) if label == RANDOM_WALK else self._ceiling()
-            return {
-                name: Sums(*(part.expand(len(seeds or [0]), -1) for part in sums))
-                for name, sums in found.items()
-            }
-        chosen = [cell for cell in self.cells[label] if seeds is None or cell.info["seed"] in seeds]
-        if way == "exact":
-            tables = [self._exact(cell.exact) for cell in chosen if cell.exact is not None]
-        else:
-            tables = [
-                episode_sums(cell.episodes[way], self.place, len(self.goal))
-                for cell in chosen
-                if way in cell.episodes
-            ]
-        if len(tables) < len(chosen) or not tables:
-            return {}
-        shared = [name for name in tables[0] if all(name in table for table in tables)]
-        return {
-            name: Sums(*(torch.cat(parts) for parts in zip(*(table[name] for table in tables), strict=True)))
-            for name in shared
-        }
-
-    def _ceiling(self) -> dict[str, Sums]:
-        table = next(iter(next(iter(self.cells.values()))[0].episodes.values()))
-        return episode_sums(shortest_paths(table), self.place, len(self.goal))
-
-    def _exact(self, table: ExactGoals) -> dict[str, Sums]:
-        """The goals that the episodes have, of a table of all."""
-        size = 1 + int(torch.cat([table.goal, self.goal]).max())
-        known = torch.full((self.scenes.num_scenes * size,), -1)
-        known[table.scene * size + table.goal] = torch.arange(len(table.goal))
-        rows = known[self.scene * size + self.goal]
-        return {
-            name: Sums(column[rows].unsqueeze(0), torch.ones(1, len(rows), dtype=torch.float64))
-            for name, column in (
-                ("success_500", table.success_500),
-                ("success_100", table.success_100),
-                ("spl", table.spl),
-            )
-        }
-
-
-def episode_sums(episodes: Episodes, place: Tensor, goals: int) -> dict[str, Sums]:
-    """Numerators and denominators of all measures, goal by goal, (1, G) each.
-
-    Args:
-        episodes: of one agent.
-        place: (n,) int64, the goal of each, 0 to G - 1.
-        goals: G.
-
-    Returns:
-        ``success_500``, ``success_100``, ``spl``, ``soft_spl`` (where the episodes tell what remained),
-        ``length_ratio`` (of the successful episodes) and ``collisions``.
-
-    >>> one = torch.tensor([1, 1])
-    >>> walked = Episodes(one, one, one, one > 0, one * 150, one * 100, one, one > 0, ("hall", "attic"), 500)
-    >>> sums = episode_sums(walked, one * 0, 1)
-    >>> {name: (over / under).item() for name, (over, under) in sums.items() if name != "spl"}
-    {'success_500': 1.0, 'success_100': 0.0, 'length_ratio': 1.5, 'collisions': 1.0}
-    """
-    success, length, shortest = episodes.success, episodes.length, episodes.shortest
-    ones = torch.ones(len(episodes), dtype=torch.float64)
-    terms: dict[str, tuple[Tensor, Tensor]] = {
-        f"success_{k}": (success & (length <= k), ones) for k in (500, 100)
-    }
-    terms["spl"] = spl_scores(success, length, shortest), ones
-    if episodes.remaining is not None:
-        terms["soft_spl"] = soft_spl_scores(length, shortest, episodes.remaining), ones
-    terms["length_ratio"] = success * length, success * shortest
-    terms["collisions"] = episodes.collisions, ones
-
-    def summed(values: Tensor) -> Tensor:
-        return torch.zeros(goals, dtype=torch.float64).index_add_(0, place, values.double()).unsqueeze(0)
-
-    return {name: Sums(summed(over), summed(under)) for name, (over, under) in terms.items()}
+        baseline = label in (RANDOM_WALK, SHORTEST_PATH)
+        every = [-1] if baseline else self.seeds(label)
+        rows = (
+            [0] * len(seeds or [0])
+            if baseline
+            else [i for i, s in enumerate(every) if seeds is None or s in seeds]
+        )
+        found, shape = {}, (len(every), len(self.goal))
+        for (model, of_mode, metric), part in self._groups.items():  # type: ignore[attr-defined]
+            if model == label and (baseline or of_mode == mode) and len(part) == shape[0] * shape[1] and rows:
+                over, under = (torch.tensor(part[name].to_numpy()) for name in ("numerator", "denominator"))
+                found[metric] = Sums(over.view(shape)[rows], under.view(shape)[rows])
+        return found
 
 
 def read_experiment(root: str | Path, names: Sequence[str], scenes: SceneSet | None = None) -> Experiment:
-    """Read the cells of experiments that share their episodes.
+    """Read the runs of experiments that share their episodes.
 
     Args:
         root: folder of results.
         names: of the experiments.
-        scenes: the world; those that the cells name when not given.
+        scenes: the world; those that the runs name when not given.
 
     Raises:
-        ResultError: there is no cell, one is damaged, or one has other episodes; the scenes are others.
+        ResultError: there is no run, one is damaged, or one has other episodes; the scenes are others.
     """
-    cells = [cell for name in names for cell in read_cells(root, name) if cell.episodes]
-    if not cells:
+    runs = [run for name in names for run in read_runs(root, name) if run.episodes]
+    if not runs:
         raise ResultError(f"{root}: no results of {' or '.join(names)}; run recipes/table1.py first")
-    first = next(iter(cells[0].episodes.values()))
-    for cell in cells:
-        for way, table in cell.episodes.items():
+    first = next(iter(runs[0].episodes.values()))
+    for run in runs:
+        for mode, table in run.episodes.items():
             same = all(
                 torch.equal(getattr(table, column), getattr(first, column))
                 for column in ("scene", "goal", "start", "trained")
             )
             if not same or table.scene_names != first.scene_names:
                 raise ResultError(
-                    f"{Path(root) / cell.experiment / cell.name}: the episodes of {way} are not those of"
-                    f" {cells[0].name}; give experiments of one manifest and the same trained goals"
+                    f"{Path(root) / run.experiment / run.name}: the episodes of {mode} are not those of"
+                    f" {runs[0].name}; give experiments of one manifest and the same trained goals"
                 )
-    scenes = SceneSet.open(list(cells[0].info["scenes"])) if scenes is None else scenes
-    walked = cells[0].info.get("scenes_fingerprint", scenes.fingerprint)
+    scenes = SceneSet.open(list(runs[0].info["scenes"])) if scenes is None else scenes
+    walked = runs[0].info.get("scenes_fingerprint", scenes.fingerprint)
     if walked != scenes.fingerprint:
-        where = Path(root) / cells[0].experiment / cells[0].name
+        where = Path(root) / runs[0].experiment / runs[0].name
         raise ResultError(
             f"{where}: of other scenes (fingerprint {walked[:12]}, and"
             f" {', '.join(scenes.names)} have {scenes.fingerprint[:12]}); give those that it was walked in"
         )
-    groups: dict[str, list[Cell]] = {}
-    for cell in sorted(cells, key=_order):
-        groups.setdefault(row_label(cell.info), []).append(cell)
-    size = 1 + int(first.goal.max())
-    keys, place = (first.scene * size + first.goal).unique(return_inverse=True)
-    trained = torch.zeros(len(keys), dtype=torch.bool)
-    trained[place[first.trained]] = True
-    scene, goal = keys // size, keys % size
-    even = exact_goals(
-        lambda state, _goal, _scene: torch.full((len(state), scenes.num_actions), 1 / scenes.num_actions),
-        scenes,
-    )
-    away = nearest_trained(scenes, scene, goal, trained)
-    return Experiment(groups, scenes, scene, goal, trained, away, place, even)
+    groups: dict[str, list[Run]] = {}
+    for run in sorted(runs, key=_order):
+        groups.setdefault(run.label, []).append(run)
+    ceiling = episode_rows(shortest_paths(first), SHORTEST_PATH, mode="exact")
+    goals = ceiling[["scene", "goal", "trained"]].drop_duplicates()
+    random_walk = exact_goals(uniform_probabilities(scenes.num_actions), scenes)
+    walk = exact_rows(random_walk, goals, scenes.names, RANDOM_WALK)
+    tables = [run.rows(goals) for runs in groups.values() for run in runs]
+    number = {name: index for index, name in enumerate(first.scene_names)}
+    scene = torch.tensor([number[name] for name in goals.scene])
+    goal, trained = (torch.tensor(goals[name].to_numpy()) for name in ("goal", "trained"))
+    distance = distance_to_trained(scenes, scene, goal, trained)
+    return Experiment(groups, scenes, join_tables([*tables, walk, ceiling]), scene, goal, trained, distance)
 
 
-def row_label(info: Mapping[str, Any]) -> str:
-    """What a cell's model is called in tables.
-
-    >>> row_label({"model": "vusfa", "row": "vusfa", "agent_preset": "paper"})
-    'vusfa (paper)'
-    """
-    name, preset = str(info.get("row", info["model"])), info.get("agent_preset", "controlled")
-    return name if preset == "controlled" else f"{name} ({preset})"
-
-
-def nearest_trained(scenes: SceneSet, scene: Tensor, goal: Tensor, trained: Tensor) -> Tensor:
-    """Fewest actions to each goal from a trained one of its scene, -1 where there is none.
-
-    Args:
-        scenes: the world.
-        scene, goal: (G,) int64.
-        trained: (G,) bool.
-
-    >>> bathroom, goals = SceneSet.bundled(["bathroom"]), torch.arange(4)
-    >>> nearest_trained(bathroom, goals * 0, goals, goals == 0).tolist()
-    [0, 1, 2, 1]
-    """
-    away = torch.full_like(goal, -1)
-    for index, room in enumerate(scenes.scenes):
-        here = scene == index
-        known = goal[here & trained]
-        if known.numel():
-            table = room.distance[known][:, goal[here]].to(torch.int64)
-            far = table.max() + 1
-            nearest = torch.where(table < 0, far, table).amin(0)
-            away[here] = torch.where(nearest == far, -1, nearest)
-    return away
-
-
-def _order(cell: Cell) -> tuple[int, str, int]:
-    model = str(cell.info["model"])
+def _order(run: Run) -> tuple[int, str, int]:
+    model = str(run.info["model"])
     rank = _FIRST.index(model) if model in _FIRST else len(_FIRST)
-    plain = row_label(cell.info) == model
-    return (rank if plain else len(_FIRST) + 1, row_label(cell.info), int(cell.info["seed"]))
+    return (rank if run.label == model else len(_FIRST) + 1, run.label, run.seed)

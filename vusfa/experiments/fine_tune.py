@@ -1,4 +1,4 @@
-"""Training on from a trained agent, towards other goals."""
+"""Fine-tuning of a trained agent towards other goals."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from torch import Tensor
 
 from vusfa.evaluation import evaluate
 from vusfa.evaluation.exact import expected_walks
-from vusfa.evaluation.metrics import length_ratio
+from vusfa.evaluation.metrics import get_metric
 from vusfa.evaluation.tabulated import TabulatedPolicy
 from vusfa.modules import ActingPolicy, sees_one_frame
 from vusfa.scenes import SceneSet
@@ -103,6 +103,5 @@ def _walked(trainer: Trainer, episodes_per_goal: int) -> tuple[float, float, flo
         seed=0,
         observe=trainer.observation,
     )
-    success, length = table.success, table.length
-    mean_length, mean_success = length.double().mean().item(), success.double().mean().item()
-    return mean_length, mean_success, length_ratio(success, length, table.shortest)
+    mean_length, success = table.length.double().mean().item(), table.success.double().mean().item()
+    return mean_length, success, get_metric("length_ratio").value(table)

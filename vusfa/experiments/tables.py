@@ -14,7 +14,15 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from vusfa.evaluation.report import MEAN_OF_SCENES, MEAN_OF_STATES, SUBSETS
+from vusfa.evaluation.baselines import RANDOM_WALK, SHORTEST_PATH
+from vusfa.evaluation.long_table import (
+    DISTANCE_BINS,
+    MEAN_OF_SCENES,
+    MEAN_OF_STATES,
+    SUBSETS,
+    distance_bin,
+)
+from vusfa.evaluation.metrics import METRICS, get_metric, metrics_within
 from vusfa.evaluation.statistics import (
     Draws,
     Estimate,
@@ -25,38 +33,30 @@ from vusfa.evaluation.statistics import (
     make_draws,
     paired_difference,
 )
-from vusfa.experiments.experiment import RANDOM_WALK, SHORTEST_PATH, Experiment
+from vusfa.experiments.experiment import Experiment
 from vusfa.modules.presets import MODELS
 
 __all__ = [
-    "MEASURES",
-    "cell_rows",
+    "COLUMNS",
     "comparison_rows",
     "distance_rows",
     "flat_rows",
     "markdown",
     "middle_rows",
     "model_rows",
+    "run_rows",
 ]
 
 Row = dict[str, Any]
 
-#: What a measure is called, and what it is multiplied by to be printed.
-MEASURES: dict[str, tuple[str, float, int]] = {
-    "success_500": ("success in 500, %", 100.0, 1),
-    "success_100": ("in 100, %", 100.0, 1),
-    "spl": ("SPL, %", 100.0, 1),
-    "soft_spl": ("soft-SPL, %", 100.0, 1),
-    "length_ratio": ("length / shortest", 1.0, 2),
-    "collisions": ("collisions", 1.0, 1),
-}
+#: The columns of a table: all metrics but ``length``, which ``length_ratio`` compares with the shortest path.
+COLUMNS = [metric.name for metric in metrics_within((500, 100), 500) if metric.name != "length"]
 COMPARED = ("success_500", "success_100", "spl")
 #: Trained goals count as solved from this share of their episodes on.
 SOLVED = 0.9
-_FROM = (0, 1, 3, 5, 8, 12)
 
 
-def cell_rows(experiment: Experiment) -> list[Row]:
+def run_rows(experiment: Experiment) -> list[Row]:
     """One row a cell: how long it was trained, whether it has solved the trained goals, and how far sampled
     and exact success are apart.
 
@@ -67,15 +67,15 @@ def cell_rows(experiment: Experiment) -> list[Row]:
         ``sum_g p_g (1 - p_g) / n_g``. NaN where there is no exact one.
     """
     rows = []
-    for label, cells in experiment.cells.items():
-        for cell in cells:
-            seed = int(cell.info["seed"])
+    for label, runs in experiment.runs.items():
+        for run in runs:
+            seed = run.seed
             found = experiment.sums(label, "sampled", [seed])["success_500"]
             exact = experiment.sums(label, "exact", [seed]).get("success_500")
             over, under = (part[0, experiment.trained].sum() for part in found)
             reached = (over / under).item()
-            row = {"model": label, "seed": seed, "cell": f"{cell.experiment}/{cell.name}"}
-            row |= {key: cell.info.get(key) for key in ("frames", "checkpoint", "training_s", "cell_s")}
+            row = {"model": label, "seed": seed, "run": f"{run.experiment}/{run.name}"}
+            row |= {key: run.info.get(key) for key in ("frames", "checkpoint", "training_s", "cell_s")}
             row |= {"trained": reached, "solved": reached >= SOLVED}
             rows.append(row | {"exact_z": math.nan if exact is None else _deviations(found, exact)})
     return rows
@@ -88,17 +88,17 @@ def _deviations(sampled: Sums, exact: Sums) -> float:
     return (gap / variance.sqrt()).item() if variance > 0 else math.nan
 
 
-def model_rows(experiment: Experiment, way: str, resamples: int = 2000) -> list[Row]:
+def model_rows(experiment: Experiment, mode: str, resamples: int = 2000) -> list[Row]:
     """One row for every model, subset of goals and scene, with both averages over the scenes; the random walk
     and the shortest path among the models.
 
     Args:
         experiment: the cells.
-        way: ``sampled``, ``greedy`` or ``exact``.
+        mode: ``sampled``, ``greedy`` or ``exact``.
         resamples: of the bootstrap over seeds and goals.
 
     Returns:
-        rows with way, goals, scene, model, seeds, num_goals and the measures that there are.
+        rows with mode, goals, scene, model, seeds, num_goals and the measures that there are.
     """
     rows, draws = [], _cached_draws(resamples)
     names = [scene.name for scene in experiment.scenes.scenes]
@@ -106,44 +106,42 @@ def model_rows(experiment: Experiment, way: str, resamples: int = 2000) -> list[
         places = [(name, mask & (experiment.scene == index)) for index, name in enumerate(names)]
         places += [(MEAN_OF_SCENES, mask), (MEAN_OF_STATES, mask)]
         for place, chosen in places:
-            head = {"way": way, "goals": subset, "scene": place}
+            head = {"mode": mode, "goals": subset, "scene": place}
             by_scene = place == MEAN_OF_SCENES
             rows += [
-                head | row for row in _rows_of(experiment, way, chosen, draws, by_scene) if bool(chosen.any())
+                head | row
+                for row in _rows_of(experiment, mode, chosen, draws, by_scene)
+                if bool(chosen.any())
             ]
     return rows
 
 
-def distance_rows(experiment: Experiment, way: str, resamples: int = 2000) -> list[Row]:
+def distance_rows(experiment: Experiment, mode: str, resamples: int = 2000) -> list[Row]:
     """One row for every model and distance of the goal from the nearest trained one, in actions.
 
     Args:
-        experiment, way, resamples: see :func:`model_rows`.
+        experiment, mode, resamples: see :func:`model_rows`.
     """
     rows, draws = [], _cached_draws(resamples)
-    for first, after in zip(_FROM, (*_FROM[1:], None), strict=True):
-        chosen = (experiment.away >= first) & (experiment.away < after if after else experiment.away >= 0)
-        words = (
-            f"{first} or more" if after is None else f"{first}–{after - 1}" if after - first > 1 else first
-        )
-        if bool(chosen.any()):
-            head = {"way": way, "distance": str(words)}
-            rows += [head | row for row in _rows_of(experiment, way, chosen, draws)]
+    bins = torch.bucketize(experiment.distance_to_trained, torch.tensor(DISTANCE_BINS), right=True) - 1
+    for index in bins[bins >= 0].unique().tolist():
+        head = {"mode": mode, "distance": distance_bin(index)}
+        rows += [head | row for row in _rows_of(experiment, mode, bins == index, draws)]
     return rows
 
 
-def middle_rows(experiment: Experiment, way: str, resamples: int = 2000) -> list[Row]:
+def middle_rows(experiment: Experiment, mode: str, resamples: int = 2000) -> list[Row]:
     """The interquartile mean over seeds and scenes, for every model and subset of goals.
 
     Args:
-        experiment, way: see :func:`model_rows`.
+        experiment, mode: see :func:`model_rows`.
         resamples: of the bootstrap over seeds within scenes.
     """
     rows = []
     for subset, mask in _subsets(experiment).items():
-        for label in experiment.cells:
-            sums = experiment.sums(label, way)
-            row: Row = {"way": way, "goals": subset, "model": label, "seeds": len(experiment.cells[label])}
+        for label in experiment.runs:
+            sums = experiment.sums(label, mode)
+            row: Row = {"mode": mode, "goals": subset, "model": label, "seeds": len(experiment.runs[label])}
             for name in COMPARED:
                 if name in sums:
                     scores = _scores(sums[name], experiment.scene, mask)
@@ -153,39 +151,39 @@ def middle_rows(experiment: Experiment, way: str, resamples: int = 2000) -> list
     return rows
 
 
-def comparison_rows(experiment: Experiment, way: str, resamples: int = 2000) -> list[Row]:
+def comparison_rows(experiment: Experiment, mode: str, resamples: int = 2000) -> list[Row]:
     """Each model against the one before it, the last against the first, and all against the untrained network
     and the random walk.
 
     Args:
-        experiment, way, resamples: see :func:`model_rows`.
+        experiment, mode, resamples: see :func:`model_rows`.
 
     Returns:
-        rows with way, goals, measure, model, against, seeds (in common), difference (of pairs: same seeds,
+        rows with mode, goals, measure, model, against, seeds (in common), difference (of pairs: same seeds,
         same goals) and improvement (chance that a run of the model does better in a scene than one of the
         other; none against the random walk).
     """
-    four = [name for name in MODELS if name in experiment.cells]
+    four = [name for name in MODELS if name in experiment.runs]
     pairs = [*zip(four[1:], four, strict=False)]
     pairs += [(four[-1], four[0])] if len(four) > 2 else []
-    extra = [label for label in experiment.cells if label not in (*MODELS, "untrained")]
+    extra = [label for label in experiment.runs if label not in (*MODELS, "untrained")]
     pairs += [(label, four[-1]) for label in extra if four]
-    pairs += [(name, "untrained") for name in four if "untrained" in experiment.cells]
-    pairs += [(label, RANDOM_WALK) for label in experiment.cells]
+    pairs += [(name, "untrained") for name in four if "untrained" in experiment.runs]
+    pairs += [(label, RANDOM_WALK) for label in experiment.runs]
     rows, draws = [], _cached_draws(resamples)
     for subset, mask in _subsets(experiment).items():
         for label, other in pairs:
             seeds = experiment.seeds(label)
             if other != RANDOM_WALK:
                 seeds = [seed for seed in seeds if seed in experiment.seeds(other)]
-            one, two = (experiment.sums(name, way, seeds) for name in (label, other))
+            one, two = (experiment.sums(name, mode, seeds) for name in (label, other))
             for name in COMPARED if seeds else ():
                 if name in one and name in two:
                     scene = experiment.scene[mask]
                     first, second = (_masked(sums[name], mask) for sums in (one, two))
                     drawn = draws(len(seeds), scene)
                     row: Row = {
-                        "way": way,
+                        "mode": mode,
                         "goals": subset,
                         "measure": name,
                         "model": label,
@@ -217,7 +215,7 @@ def flat_rows(rows: Iterable[Row]) -> list[Row]:
 
 
 def markdown(rows: Sequence[Row], columns: Sequence[str]) -> str:
-    """A table in Markdown; estimates as "value [low, high]", in the units of :data:`MEASURES`, and
+    """A table in Markdown; estimates as "value [low, high]", in the units of the registry, and
     differences of shares in percentage points.
 
     Args:
@@ -232,27 +230,34 @@ def markdown(rows: Sequence[Row], columns: Sequence[str]) -> str:
     | walk | – |
     """
     shown = [name for name in columns if any(name in row for row in rows)]
-    heads = [MEASURES[name][0] if name in MEASURES else name.replace("_", " ") for name in shown]
+    heads = [get_metric(name).heading if _is_metric(name) else name.replace("_", " ") for name in shown]
     lines = [f"| {' | '.join(heads)} |", "|" + "---|" * len(shown)]
     lines += [f"| {' | '.join(_text(name, row.get(name)) for name in shown)} |" for row in rows]
     return "\n".join(lines)
 
 
+def _is_metric(name: Any) -> bool:
+    return name in METRICS or str(name).startswith("success_")
+
+
 def _text(name: str, value: Any) -> str:
-    _, scale, digits = MEASURES.get(name, ("", 100.0, 1))
     if isinstance(value, Estimate):
-        low, high = (f"{scale * end:.{digits}f}" for end in value[1:])
-        ends = "" if math.isnan(value.low) else f" [{low}, {high}]"
-        return "–" if math.isnan(value.value) else f"{scale * value.value:.{digits}f}{ends}"
+        metric = get_metric(name if _is_metric(name) else "success_500")  # differences are of shares
+        low, high = (metric.text(end) for end in value[1:])
+        return metric.text(value.value) + ("" if math.isnan(value.low) else f" [{low}, {high}]")
     if isinstance(value, bool):
         return "yes" if value else "no"
-    if name == "trained" and isinstance(value, float):
-        return f"{100 * value:.1f}"
     if isinstance(value, float):
-        return "–" if math.isnan(value) else f"{value:.1f}"
+        return (
+            get_metric("success_500").text(value)
+            if name == "trained"
+            else "–"
+            if math.isnan(value)
+            else f"{value:.1f}"
+        )
     if isinstance(value, int):
         return f"{value:,}"
-    return "–" if value is None else MEASURES[value][0] if value in MEASURES else str(value)
+    return "–" if value is None else get_metric(value).heading if _is_metric(value) else str(value)
 
 
 def _subsets(experiment: Experiment) -> dict[str, Tensor]:
@@ -272,13 +277,15 @@ def _cached_draws(resamples: int) -> Any:
     return draws
 
 
-def _rows_of(experiment: Experiment, way: str, mask: Tensor, draws: Any, by_scene: bool = False) -> list[Row]:
+def _rows_of(
+    experiment: Experiment, mode: str, mask: Tensor, draws: Any, by_scene: bool = False
+) -> list[Row]:
     rows, scene = [], experiment.scene[mask]
-    for label in (*experiment.cells, RANDOM_WALK, SHORTEST_PATH):
-        sums = experiment.sums(label, way) if bool(mask.any()) else {}
+    for label in (*experiment.runs, RANDOM_WALK, SHORTEST_PATH):
+        sums = experiment.sums(label, mode) if bool(mask.any()) else {}
         if not sums:
             continue
-        seeds = len(sums["success_500"].numerator) if label in experiment.cells else 0
+        seeds = len(sums["success_500"].numerator) if label in experiment.runs else 0
         row: Row = {"model": label, "seeds": seeds or "–", "num_goals": int(mask.sum())}
         for name, table in sums.items():
             part = _masked(table, mask)

@@ -8,13 +8,13 @@ from pathlib import Path
 from vusfa.errors import ConfigError
 from vusfa.report.content import Options, Row, add_pictures, gather, open_scenes
 from vusfa.report.page import page_weight, write_page, write_tables
-from vusfa.report.runs import Run
+from vusfa.report.runs import LoggedRun
 
 __all__ = ["write_report"]
 
 
 def write_report(
-    runs: Sequence[Run], out: str | Path, options: Options | None = None
+    runs: Sequence[LoggedRun], out: str | Path, options: Options | None = None
 ) -> tuple[list[Path], dict[str, list[Row]]]:
     """Writes the page, and its tables as CSV into a folder beside it, ``PAGE_tables``.
 

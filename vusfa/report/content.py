@@ -11,15 +11,17 @@ import torch
 
 import vusfa
 from vusfa.errors import ConfigError
-from vusfa.evaluation import random_walk
+from vusfa.evaluation import get_metric, random_walk
+from vusfa.evaluation.baselines import RANDOM_WALK
+from vusfa.evaluation.summary import metric_columns
 from vusfa.report.by_goal import distance_rows, goal_rows
 from vusfa.report.curves import learning_curves
 from vusfa.report.explorer import choose_goals, choose_starts, sampled_walks, state_maps
 from vusfa.report.geometry import floor_plan
 from vusfa.report.packing import pack
 from vusfa.report.pictures import thumbnails
-from vusfa.report.runs import Run
-from vusfa.report.tables import measures, reference_rows, run_rows, seed_rows, summary_rows
+from vusfa.report.runs import LoggedRun
+from vusfa.report.tables import reference_rows, run_rows, seed_rows, summary_rows
 from vusfa.scenes import Scene, SceneSet
 from vusfa.training import load_agent
 
@@ -58,14 +60,14 @@ class Options:
     tell: Callable[[str], None] = field(default=lambda line: None)
 
 
-def open_scenes(runs: Sequence[Run]) -> dict[str, Scene]:
+def open_scenes(runs: Sequence[LoggedRun]) -> dict[str, Scene]:
     """The scenes of all runs, by name.
 
     Raises:
         ConfigError: two runs have different scenes of one name.
         SceneError: a scene is not where it was.
     """
-    found: dict[str, tuple[Scene, Run]] = {}
+    found: dict[str, tuple[Scene, LoggedRun]] = {}
     for run in runs:
         for scene in SceneSet.open(run.scenes).scenes if run.scenes else ():
             known, first = found.setdefault(scene.name, (scene, run))
@@ -77,7 +79,7 @@ def open_scenes(runs: Sequence[Run]) -> dict[str, Scene]:
     return {name: scene for name, (scene, _) in found.items()}
 
 
-def tables(runs: Sequence[Run], scenes: Mapping[str, Scene], options: Options) -> dict[str, list[Row]]:
+def tables(runs: Sequence[LoggedRun], scenes: Mapping[str, Scene], options: Options) -> dict[str, list[Row]]:
     """The report's tables by name: summary, seeds, distance, goals, runs.
 
     Args:
@@ -111,7 +113,7 @@ def goal_limit(states: Sequence[int], agents: int, options: Options) -> int:
 
 
 def gather(
-    runs: Sequence[Run], options: Options | None = None
+    runs: Sequence[LoggedRun], options: Options | None = None
 ) -> tuple[dict[str, Any], dict[str, list[Row]]]:
     """Everything on the page but the pictures (see :func:`add_pictures`).
 
@@ -151,8 +153,8 @@ def gather(
             "torch": torch.__version__,
             "python": platform.python_version(),
         },
-        "within": [int(name[8:]) for name in measures(rows["summary"]) if name.startswith("success_")],
-        "measures": measures(rows["summary"]),
+        "metrics": _metrics(rows),
+        "hardest": _hardest(rows["summary"][0]) if rows["summary"] else None,
         "models": [{"label": label, "seeds": sum(run.label == label for run in runs)} for label in labels],
         "tables": {name: rows[name] for name in ("summary", "seeds", "distance", "runs")},
         "curves": learning_curves(runs),
@@ -167,6 +169,21 @@ def gather(
         options.tell(f"explorer: {run.name}")
         content["agents"].append(_explored(run, goals, options))
     return content, rows
+
+
+def _metrics(rows: Mapping[str, Sequence[Row]]) -> list[Row]:
+    """How the page shows each metric, in order; ``exact`` marks those of the floor maps alone."""
+    found = [(name, get_metric(name), False) for name in metric_columns(rows["summary"])]
+    logged = dict.fromkeys(name for row in rows["goals"] for name in row if name.startswith("exact_"))
+    for name in sorted(logged, key=lambda name: (not name[6:].isdigit(), name)):
+        part = name.removeprefix("exact_")
+        found.append((name, get_metric(f"success_{part}" if part.isdigit() else part), True))
+    return [
+        {"name": name, "exact": exact, "share": metric.unit == "%", "digits": metric.digits}
+        | {"better": 1 if metric.higher_is_better else -1, "label": metric.label}
+        | {"title": f"{metric.title}, exact" if exact else metric.title}
+        for name, metric, exact in found
+    ]
 
 
 def add_pictures(content: dict[str, Any], scenes: Mapping[str, Scene], budget: int) -> None:
@@ -189,7 +206,7 @@ def _explored_goals(scene: Scene, rows: Sequence[Row], limit: int) -> list[int]:
     here = [row for row in rows if row["scene"] == scene.name]
     success, weight = torch.zeros(scene.num_states), torch.zeros(scene.num_states)
     for row in here:
-        hardest = min(key for key in row if key.startswith("success_"))
+        hardest = _hardest(row)
         success[row["goal"]] += row[hardest] * row["num_episodes"]
         weight[row["goal"]] += row["num_episodes"]
     trained = [row["goal"] for row in here if row["trained"]]
@@ -204,7 +221,7 @@ def _success_maps(rows: Sequence[Row], scenes: Mapping[str, Scene], within: Sequ
     maps: list[Row] = []
     for (label, name), cells in found.items():
         known = dict.fromkeys(key for cell in cells for key in cell)
-        names = [key for key in known if key.startswith(("success_", "exact_1", "exact_5")) or key == "spl"]
+        names = [key for key in known if key.startswith("exact_") or _is_share(key)]
         columns = {key: torch.full((scenes[name].num_states,), torch.nan) for key in names}
         for cell in cells:
             for key in names:
@@ -219,13 +236,22 @@ def _success_maps(rows: Sequence[Row], scenes: Mapping[str, Scene], within: Sequ
         exact = {f"success_{k}": random_walk(scenes[name], every, k) for k in within}
         exact |= {name.replace("success", "exact"): column for name, column in exact.items()}
         maps.append(
-            {"model": "random walk", "scene": name, "trained": [], "episodes": 0, "seeds": 0}
+            {"model": RANDOM_WALK, "scene": name, "trained": [], "episodes": 0, "seeds": 0}
             | {key: pack(column, "u8", 0.0, 1.0) for key, column in exact.items()}
         )
     return maps
 
 
-def _explored(run: Run, goals: Mapping[str, Sequence[int]], options: Options) -> Row:
+def _hardest(row: Row) -> str:
+    """The success within the fewest actions."""
+    return [name for name in metric_columns([row]) if name.startswith("success_")][-1]
+
+
+def _is_share(name: str) -> bool:
+    return bool(metric_columns([{name: 0.0}])) and get_metric(name).unit == "%"
+
+
+def _explored(run: LoggedRun, goals: Mapping[str, Sequence[int]], options: Options) -> Row:
     assert run.checkpoint is not None
     agent, scenes, state = load_agent(run.checkpoint)
     config, found = agent.config, {}

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from vusfa.report.runs import Run
+from vusfa.report.runs import LoggedRun
 
 __all__ = ["band", "curve_names", "learning_curves"]
 
@@ -29,12 +29,12 @@ _PLAIN = (
 _PER_SCENE = ("success", "length", "length_ratio")
 
 
-def curve_names(runs: Sequence[Run]) -> list[str]:
+def curve_names(runs: Sequence[LoggedRun]) -> list[str]:
     """Columns of metrics.csv that the page draws: the general ones that any run logged, and the scenes'.
 
     >>> from pathlib import Path
     >>> log = dict.fromkeys(["frames", "success", "scene/hall/success", "lr"], np.ones(1))
-    >>> curve_names([Run("gvf", 0, Path(), {}, log)])
+    >>> curve_names([LoggedRun("gvf", 0, Path(), {}, log)])
     ['success', 'scene/hall/success']
     """
     logged = dict.fromkeys(name for run in runs for name in run.curves)
@@ -78,7 +78,7 @@ def band(
     return {"x": grid.tolist(), **{name: _plain(part) for name, part in parts.items()}}
 
 
-def learning_curves(runs: Sequence[Run]) -> list[dict[str, Any]]:
+def learning_curves(runs: Sequence[LoggedRun]) -> list[dict[str, Any]]:
     """The curves of every model and measure, for the page.
 
     Args:

@@ -15,11 +15,13 @@ from tensordict import TensorDict
 from torch import Tensor
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from vusfa.envs.dynamics import Rewards, start_history, step
+from vusfa.envs.dynamics import start_history
+from vusfa.evaluation import trails
 from vusfa.evaluation.navigation import Observe
 from vusfa.modules import Agent, frozen
 from vusfa.scenes import Scene, SceneSet
 from vusfa.scenes.poses import spread_poses
+from vusfa.training import make_observation
 
 __all__ = [
     "StateMaps",
@@ -69,8 +71,6 @@ def state_maps(
     >>> maps.value.shape, maps.probabilities.shape, maps.components.shape
     (torch.Size([2, 176]), torch.Size([2, 176, 4]), torch.Size([2, 176, 3]))
     """
-    from vusfa.training import make_observation  # it builds on this package's evaluation
-
     observe = make_observation(agent, scenes)
     actor, critic = agent.get_policy_operator(), agent.get_value_operator()
     num_states, device = scenes.scenes[scene].num_states, scenes.device
@@ -127,57 +127,13 @@ def principal_components(values: Tensor, count: int) -> tuple[Tensor, Tensor]:
     return (found * torch.where(largest < 0, -1.0, 1.0)).float(), share.float().clamp(max=1.0)
 
 
-@torch.no_grad()
 def sampled_walks(
     agent: Agent, scenes: SceneSet, start: Tensor, goal: Tensor, max_steps: int = 500, seed: int = 0
 ) -> list[list[int]]:
-    """Walks with actions drawn from the policy, one from every start, and the way of each.
-
-    Args:
-        agent: in evaluation mode, on the scenes' device.
-        scenes: the world.
-        start, goal: (n,) global state ids.
-        max_steps: actions allowed.
-        seed: of the actions; the caller's random state is left as it was.
-
-    Returns:
-        n lists of global state ids, the start first; a walk that arrived ends with its goal.
-
-    >>> from vusfa.modules import make_agent
-    >>> scenes = SceneSet.bundled(["bathroom"])
-    >>> agent = make_agent("gvf", scenes=scenes, hidden_size=16).eval()
-    >>> (walk,) = sampled_walks(agent, scenes, torch.tensor([5]), torch.tensor([9]), max_steps=7)
-    >>> walk[0], len(walk) <= 8
-    (5, True)
-    """
-    from vusfa.training import make_observation
-
-    observe, policy = make_observation(agent, scenes), agent.get_policy_operator()
-    memory_keys = [key[1:] for key in policy.out_keys if isinstance(key, tuple) and key[0] == "next"]
-    device, rewards, memory = scenes.device, Rewards.of(), dict[tuple[str, ...], Tensor]()
-    start, goal = start.to(device), goal.to(device)
-    frames, steps = start_history(start, agent.config["history"]), torch.zeros_like(start).unsqueeze(-1)
-    visited, length = [start], torch.full_like(start, max_steps)
-    devices = [device] if device.type == "cuda" else []
-    with torch.random.fork_rng(devices), frozen(agent), set_exploration_type(ExplorationType.RANDOM):
-        torch.manual_seed(seed)
-        for taken in range(1, max_steps + 1):
-            batch = _batch(scenes, frames, goal)
-            for key, value in memory.items():
-                batch.set(key, value)
-            batch.set("is_init", steps == 0)
-            batch = policy(batch if observe is None else observe(batch))
-            end = step(
-                scenes.successor, scenes.blocked, rewards, max_steps, frames, goal, steps, batch["action"]
-            )
-            frames, steps = end.state_id, end.step_count
-            visited.append(frames[:, -1])
-            length = torch.where(end.terminated.squeeze(-1), length.clamp(max=taken), length)
-            memory = {key: batch.get(("next", *key)) for key in memory_keys}
-            if bool((length <= taken).all()):
-                break
-    ways = torch.stack(visited, 1).tolist()
-    return [way[: end + 1] for way, end in zip(ways, length.tolist(), strict=True)]
+    """An agent's ways with actions drawn from its policy, see :func:`vusfa.evaluation.trails`."""
+    observe, history = make_observation(agent, scenes), agent.config["history"]
+    options: dict[str, Any] = {"max_steps": max_steps, "history": history, "seed": seed, "observe": observe}
+    return trails(agent.get_policy_operator(), scenes, start, goal, **options)
 
 
 def choose_goals(scene: Scene, trained: Sequence[int], success: Tensor | None, count: int) -> list[int]:

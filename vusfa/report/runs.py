@@ -11,22 +11,25 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import torch
 
 from vusfa.errors import ConfigError
 from vusfa.evaluation import Episodes
 from vusfa.evaluation.exact import ExactGoals
+from vusfa.evaluation.long_table import WITHIN, episode_rows, exact_rows, join_tables, row_label
+from vusfa.report.curve import read_metrics
 from vusfa.training import row_name
 
-__all__ = ["Run", "read_curves", "read_episodes", "read_run", "run_label", "split_name"]
+__all__ = ["LoggedRun", "read_episodes", "read_run", "run_label", "split_name"]
 
 _EVALUATIONS = ("zero_shot", "evaluation")
 _COLUMNS = ("goal", "start", "success", "length", "shortest", "collisions", "trained")
 
 
 @dataclass(frozen=True, eq=False)
-class Run:
-    """One training and what it was worth.
+class LoggedRun:
+    """One training: its log, its checkpoint and its evaluation.
 
     Args:
         label: what its model is called on the page; runs of one label are seeds of one thing.
@@ -39,7 +42,7 @@ class Run:
         checkpoint: path of its weights, or None.
         variant: how actions were taken in the evaluation: "sampled" or "greedy".
         exact: its goals' exact chances, or None.
-        told: frames and seconds of the training, where there is no log to tell.
+        facts: frames and seconds of the training, where there is no log.
     """
 
     label: str
@@ -52,7 +55,22 @@ class Run:
     checkpoint: Path | None = None
     variant: str = "sampled"
     exact: ExactGoals | None = None
-    told: Mapping[str, float] = field(default_factory=dict)
+    facts: Mapping[str, float] = field(default_factory=dict)
+
+    def rows(self, within: Sequence[int] = WITHIN) -> pd.DataFrame:
+        """Its evaluation as a long table, see :mod:`vusfa.evaluation.long_table`.
+
+        Raises:
+            ValueError: it has none.
+        """
+        if self.episodes is None:
+            raise ValueError(f"{self.name} has no evaluation")
+        head: dict[str, Any] = {"model": self.label, "run": str(self.folder), "seed": self.seed}
+        table = episode_rows(self.episodes, mode=self.variant, within=within, **head)
+        if self.exact is None:
+            return table
+        goals = table[["scene", "goal", "trained"]].drop_duplicates()
+        return join_tables([table, exact_rows(self.exact, goals, self.episodes.scene_names, **head)])
 
     @property
     def name(self) -> str:
@@ -62,12 +80,12 @@ class Run:
     @property
     def frames(self) -> float:
         """Frames trained for; NaN where nothing tells."""
-        return self.told.get("frames", _last(self.curves, "frames"))
+        return self.facts.get("frames", _last(self.curves, "frames"))
 
     @property
     def seconds(self) -> float:
         """Wall-clock seconds of the training; NaN where nothing tells."""
-        return self.told.get("seconds", _last(self.curves, "seconds"))
+        return self.facts.get("seconds", _last(self.curves, "seconds"))
 
     @property
     def scenes(self) -> list[str]:
@@ -81,7 +99,7 @@ def _last(curves: Mapping[str, np.ndarray], name: str) -> float:
     return float(column[-1]) if column is not None and len(column) else math.nan
 
 
-def read_run(source: str | Path) -> Run:
+def read_run(source: str | Path) -> LoggedRun:
     """Reads one run.
 
     Args:
@@ -105,12 +123,12 @@ def read_run(source: str | Path) -> Run:
         )
     log, checkpoint = folder / "metrics.csv", folder / "checkpoint.pt"
     episodes, references, variant = _evaluation(folder)
-    return Run(
+    return LoggedRun(
         label or run_label(settings),
         int(settings.get("seed", 0)),
         folder,
         settings,
-        read_curves(log) if log.is_file() else {},
+        read_metrics(log) if log.is_file() else {},
         episodes,
         references,
         checkpoint if checkpoint.is_file() else None,
@@ -119,29 +137,14 @@ def read_run(source: str | Path) -> Run:
 
 
 def run_label(settings: Mapping[str, Any]) -> str:
-    """What a run's model is called when nothing else is said: its row's name in the tables, and its preset
-    unless that is ``controlled``.
+    """What a run's model is called unless it is given a name, see
+    :func:`~vusfa.evaluation.long_table.row_label`.
 
-    >>> run_label({"agent": {"model": "usfa", "preset": "paper"}})
+    >>> run_label({"agent": {"model": "usfa", "architecture": "paper"}})
     'usfa (paper)'
     """
-    preset = settings["agent"].get("preset") or "controlled"
-    return row_name(settings) + ("" if preset == "controlled" else f" ({preset})")
-
-
-def read_curves(path: Path) -> dict[str, np.ndarray]:
-    """The columns of a metrics.csv, each (n,) float64; an empty field is NaN.
-
-    Raises:
-        ConfigError: a field that is no number.
-    """
-    with open(path, newline="", encoding="utf-8") as file:
-        rows = list(csv.DictReader(file))
-    names = list(rows[0]) if rows else []
-    try:
-        return {name: np.array([float(row[name] or "nan") for row in rows]) for name in names}
-    except (TypeError, ValueError) as error:
-        raise ConfigError(f"{path}: {error}; it is to hold numbers alone, see docs/training.md") from error
+    agent = settings["agent"]
+    return row_label(row_name(settings), agent.get("architecture", agent.get("preset")))
 
 
 def read_episodes(path: Path, max_steps: int) -> Episodes:

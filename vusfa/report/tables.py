@@ -3,19 +3,22 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
+import pandas as pd
 import torch
 
 from vusfa.evaluation import Episodes, random_walk_summary, shortest_paths, summary
+from vusfa.evaluation.baselines import SHORTEST_PATH
+from vusfa.evaluation.long_table import WITHIN, join_tables, select_goals
+from vusfa.evaluation.summary import metric_columns
 from vusfa.report.intervals import intervals
-from vusfa.report.runs import Run
+from vusfa.report.runs import LoggedRun
 from vusfa.scenes import SceneSet
 
 __all__ = [
-    "MEASURES",
-    "measures",
+    "long_table",
     "over_seeds",
     "reference_rows",
     "run_rows",
@@ -25,20 +28,11 @@ __all__ = [
 
 Row = dict[str, Any]
 
-MEASURES = ("spl", "length", "length_ratio", "collisions")
 
-
-def measures(rows: Iterable[Mapping[str, Any]]) -> list[str]:
-    """The columns of summaries that hold measures, in the order in which tables show them.
-
-    >>> measures([{"policy": "gvf", "success_100": 0.5, "spl": 0.2, "success_500": 0.8}])
-    ['success_500', 'success_100', 'spl']
-    """
-    names = {key for row in rows for key in row}
-    limits = sorted(
-        (key for key in names if key.removeprefix("success_").isdigit()), key=lambda key: -int(key[8:])
-    )
-    return [*limits, *(name for name in MEASURES if name in names)]
+def long_table(runs: Sequence[LoggedRun], within: Sequence[int] = WITHIN) -> pd.DataFrame | None:
+    """The long table of all runs that were evaluated; None when none was."""
+    tables = [run.rows(within) for run in runs if run.episodes is not None]
+    return join_tables(tables) if tables else None
 
 
 def over_seeds(rows: Sequence[Mapping[str, Any]], names: Sequence[str]) -> Row:
@@ -58,7 +52,7 @@ def over_seeds(rows: Sequence[Mapping[str, Any]], names: Sequence[str]) -> Row:
     return result
 
 
-def seed_rows(runs: Sequence[Run], within: Sequence[int] = (500, 100)) -> list[Row]:
+def seed_rows(runs: Sequence[LoggedRun], within: Sequence[int] = WITHIN) -> list[Row]:
     """One row for each run, set of goals and scene: :func:`vusfa.evaluation.summary` with the seed beside it.
 
     Args:
@@ -74,7 +68,7 @@ def seed_rows(runs: Sequence[Run], within: Sequence[int] = (500, 100)) -> list[R
 
 
 def summary_rows(
-    runs: Sequence[Run], within: Sequence[int] = (500, 100), beside: Sequence[Mapping[str, Any]] = ()
+    runs: Sequence[LoggedRun], within: Sequence[int] = WITHIN, beside: Sequence[Mapping[str, Any]] = ()
 ) -> list[Row]:
     """One row for each model, set of goals and scene; then the policies that the runs stand beside.
 
@@ -89,16 +83,21 @@ def summary_rows(
         ``_from`` and ``_to`` of its 95 % interval, see :mod:`vusfa.report.intervals`.
     """
     single = seed_rows(runs, within)
-    names = measures(single)
+    names = metric_columns(single)
     groups: dict[tuple[str, str, str], list[Row]] = {}
     for row in single:
         groups.setdefault((row["model"], row["goals"], row["scene"]), []).append(row)
-    tables = {run.label: [r.episodes for r in runs if r.label == run.label and r.episodes] for run in runs}
+    tables = {(run.label, run.seed): run.rows(within) for run in runs if run.episodes}
+    tables = {key: table[table["mode"] != "exact"] for key, table in tables.items()}
+
+    def of(label: str, goals: str) -> list[pd.DataFrame]:
+        return [select_goals(table, goals) for (model, _), table in tables.items() if model == label]
+
     rows = [
         {"model": label, "kind": "model", "goals": goals, "scene": scene, "seeds": len(group)}
         | {key: group[0][key] for key in ("num_goals", "num_episodes")}
         | over_seeds(group, names)
-        | intervals([_of(table, goals) for table in tables[label]], scene, names)
+        | intervals(of(label, goals), scene, names)
         for (label, goals, scene), group in groups.items()
     ]
     others: dict[tuple[str, str, str], Row] = {}
@@ -111,13 +110,7 @@ def summary_rows(
     return rows
 
 
-def _of(episodes: Episodes, goals: str) -> Episodes:
-    if goals == "all":
-        return episodes
-    return episodes.select(episodes.trained if goals == "trained" else ~episodes.trained)
-
-
-def reference_rows(run: Run, scenes: SceneSet, within: Sequence[int] = (500, 100)) -> list[Row]:
+def reference_rows(run: LoggedRun, scenes: SceneSet, within: Sequence[int] = WITHIN) -> list[Row]:
     """What a run stands between, on its own goals: the random walk, exactly, and the shortest path.
 
     Args:
@@ -135,13 +128,14 @@ def reference_rows(run: Run, scenes: SceneSet, within: Sequence[int] = (500, 100
     goals = world.offsets[table.scene] + table.goal
     trained = goals[table.trained].unique()
     exact = random_walk_summary(world, goals.unique(), trained, table.max_steps, within)
-    return [*exact, *summary(shortest_paths(table), "shortest path", within)]
+    return [*exact, *summary(shortest_paths(table), SHORTEST_PATH, within)]
 
 
-def run_rows(runs: Sequence[Run]) -> list[Row]:
-    """One row a run: what was trained, how long, on what.
+def run_rows(runs: Sequence[LoggedRun]) -> list[Row]:
+    """One row per run: what was trained, how long, on what.
 
-    >>> run_rows([Run("gvf", 3, __import__("pathlib").Path("runs/a"), {"scenes": "bathroom"})])[0]["seed"]
+    >>> from pathlib import Path
+    >>> run_rows([LoggedRun("gvf", 3, Path("runs/a"), {"scenes": "bathroom"})])[0]["seed"]
     3
     """
     rows = []

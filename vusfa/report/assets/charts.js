@@ -78,11 +78,11 @@ function drawOverview() {
 function drawSummary() {
   const rows = rowsOf("summary");
   const best = {};
-  for (const name of DATA.measures) {
+  for (const name of SHOWN) {
     const values = rows.filter((row) => row.kind === "model" && known(row[name])).map((row) => row[name]);
-    best[name] = values.length > 1 ? (isShare(name) ? Math.max(...values) : Math.min(...values)) : null;
+    best[name] = values.length > 1 ? Math[METRICS[name].better > 0 ? "max" : "min"](...values) : null;
   }
-  const head = make("tr", {}, make("th", {}, "model"), make("th", {}, "seeds"), ...DATA.measures.map((name) => make("th", {}, headOf(name))));
+  const head = make("tr", {}, make("th", {}, "model"), make("th", {}, "seeds"), ...SHOWN.map((name) => make("th", {}, headOf(name))));
   const body = rows.map((row) => {
     const label = make("td", {});
     if (row.kind === "model") {
@@ -91,7 +91,7 @@ function drawSummary() {
       label.append(dot);
     }
     label.append(row.model);
-    const cells = DATA.measures.map((name) => {
+    const cells = SHOWN.map((name) => {
       const cell = make("td", row[name] === best[name] && row.kind === "model" ? { class: "best" } : {}, number(name, row[name]));
       if (known(row[`${name}_from`])) cell.append(make("small", {}, `${number(name, row[`${name}_from`])} – ${number(name, row[`${name}_to`])}`));
       return cell;
@@ -167,13 +167,14 @@ function drawCurves() {
 }
 
 function drawRuns() {
+  const share = (value) => (known(value) ? (100 * value).toFixed(1) : "–");
   const rows = DATA.tables.runs;
-  const told = (key) => rows.some((row) => row[key] !== "" && row[key] !== null) && (key !== "scenes" || new Set(rows.map((row) => row.scenes)).size > 1);
+  const logged = (key) => rows.some((row) => row[key] !== "" && row[key] !== null) && (key !== "scenes" || new Set(rows.map((row) => row.scenes)).size > 1);
   const columns = [
     ["model", "model", String], ["seed", "seed", String], ["folder", "folder", String], ["frames", "frames", (v) => (known(v) ? grouped(v) : "–")],
     ["minutes", "minutes", (v) => (known(v) ? v.toFixed(1) : "–")], ["device", "device", String], ["history", "frames seen", (v) => (known(v) ? String(v) : "–")],
-    ["trained_success", "trained goals (%)", (v) => number("spl", v)], ["unseen_success", "unseen goals (%)", (v) => number("spl", v)], ["evaluated", "evaluated", String], ["scenes", "scenes", words],
-  ].filter(([key]) => told(key));
+    ["trained_success", "trained goals (%)", share], ["unseen_success", "unseen goals (%)", share], ["evaluated", "evaluated", String], ["scenes", "scenes", words],
+  ].filter(([key]) => logged(key));
   const left = (key) => (key === "scenes" ? { class: "left wrap" } : ["folder", "device", "evaluated"].includes(key) ? { class: "left" } : {});
   const head = make("tr", {}, ...columns.map(([key, title]) => make("th", left(key), title)));
   const body = rows.map((row) => make("tr", {}, ...columns.map(([key, , format]) => make("td", left(key), format(row[key])))));
@@ -185,10 +186,10 @@ function startCharts() {
   const unique = (key) => [...new Set(rows.map((row) => row[key]))];
   const scenes = unique("scene");
   const subsets = unique("goals");
-  fill($("measure"), DATA.measures.map((name) => [name, titleOf(name)]), DATA.measures.find((name) => name.startsWith("success_")));
+  fill($("measure"), SHOWN.map((name) => [name, titleOf(name)]), SHOWN[0]);
   fill($("subset"), subsets.map((name) => [name, name]), subsets.includes("unseen") ? "unseen" : subsets[0]);
   fill($("scene"), [...scenes].sort((a, b) => b.startsWith("mean of") - a.startsWith("mean of")).map((name) => [name, words(name)]));
-  fill($("distance-measure"), DATA.measures.filter(isShare).map((name) => [name, titleOf(name)]));
+  fill($("distance-measure"), SHOWN.filter(isShare).map((name) => [name, titleOf(name)]));
   const curves = [...new Set(DATA.curves.map((curve) => curve.name))];
   fill($("curve"), curves.filter((name) => !name.includes("/")).map((name) => [name, CURVES[name] || name]));
   const curveScenes = [...new Set(curves.filter((name) => name.startsWith("scene/")).map((name) => name.split("/")[1]))];

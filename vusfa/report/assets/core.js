@@ -80,22 +80,17 @@ function drawScale(host, stops, low, high, unit) {
 
 // ---- numbers and names in words
 
-const HEADS = { spl: "SPL", length: "length", length_ratio: "ratio", collisions: "blocked" };
-const TITLES = {
-  spl: "SPL: success weighted by shortest path over path (%)",
-  length: "Length of the episodes that arrived (actions)",
-  length_ratio: "Length over shortest path",
-  collisions: "Blocked actions (an episode)",
-};
-const isShare = (name) => name.startsWith("success_") || name.startsWith("exact_") || name === "spl";
-const headOf = (name) => HEADS[name] || `within ${name.slice(8)}`;
-const titleOf = (name) => TITLES[name] || (name.startsWith("exact_") ? `Exact chance of reaching it within ${name.slice(6)} actions (%)` : `Goals reached within ${name.slice(8)} actions (%)`);
+const METRICS = Object.fromEntries(DATA.metrics.map((metric) => [metric.name, metric]));
+const SHOWN = DATA.metrics.filter((metric) => !metric.exact).map((metric) => metric.name);
+const isShare = (name) => Boolean(METRICS[name]?.share);
+const headOf = (name) => METRICS[name].label;
+const titleOf = (name) => METRICS[name].title + (isShare(name) ? " (%)" : "");
 const words = (name) => String(name).replaceAll("_", " ");
 const known = (value) => value !== null && value !== undefined && Number.isFinite(value);
 
 function number(name, value) {
   if (!known(value)) return "–";
-  return isShare(name) ? (100 * value).toFixed(1) : value.toFixed(2);
+  return ((isShare(name) ? 100 : 1) * value).toFixed(METRICS[name].digits);
 }
 
 // 99.95 % is not 100 %, nor is 0.3 % nothing

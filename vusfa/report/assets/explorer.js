@@ -177,10 +177,10 @@ function chooseGoal() {
 function listGoals(wanted) {
   const agent = agentNow(), scene = sceneNow(), before = wanted ?? Number($("x-goal").value);
   const row = DATA.maps.find((item) => item.model === agent.model && item.scene === scene);
-  const hardest = row && DATA.measures.filter((name) => row[name] && name.startsWith("success_")).at(-1);
+  const hardest = row && row[DATA.hardest] && DATA.hardest;
   fill($("x-goal"), DATA.goals[scene].map((goal) => {
     const trained = agent.trained[scene]?.includes(goal) ? " · trained" : "";
-    const success = hardest ? ` · ${percent(unpack(row[hardest])[goal])} within ${hardest.slice(8)}` : "";
+    const success = hardest ? ` · ${percent(unpack(row[hardest])[goal])} ${headOf(hardest)}` : "";
     return [goal, `${goal}${trained}${success}`];
   }), before);
   chooseGoal();

@@ -94,10 +94,8 @@ function startMaps() {
   const grid = $("map-grid");
   const labels = [...new Set(DATA.maps.map((row) => row.model))];
   const names = [...new Set(DATA.maps.flatMap((row) => Object.keys(row).filter(isShare)))];
-  const exact = names.filter((name) => name.startsWith("exact_") && DATA.maps.some((row) => row.seeds && row[name]));
-  const order = [...DATA.measures.filter((name) => names.includes(name)), ...exact];
-  const hardest = order.filter((name) => name.startsWith("success_")).at(-1);
-  fill($("map-measure"), order.map((name) => [name, titleOf(name).replace(/^Goals reached/, "Reached")]), hardest);
+  const order = DATA.metrics.map((metric) => metric.name).filter((name) => names.includes(name));
+  fill($("map-measure"), order.map((name) => [name, titleOf(name)]), DATA.hardest);
   $("maps").hidden = !DATA.maps.length;
   for (const label of labels) {
     const rows = DATA.maps.filter((row) => row.model === label);

@@ -8,11 +8,9 @@ from pathlib import Path
 import torch
 from PIL import Image, ImageDraw, ImageFont
 from tensordict.nn import TensorDictModuleBase
-from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from vusfa.envs import TargetNavEnv
 from vusfa.envs.rendering import draw_panels
-from vusfa.evaluation.episodes import Episodes
+from vusfa.evaluation import Episodes, trails
 from vusfa.files import replacing
 from vusfa.scenes import SceneSet
 
@@ -36,7 +34,6 @@ def longest_success(episodes: Episodes, scenes: SceneSet) -> tuple[int, int] | N
     )
 
 
-@torch.no_grad()
 def record_walk(
     policy: TensorDictModuleBase,
     scenes: SceneSet,
@@ -48,7 +45,7 @@ def record_walk(
     attempts: int = 10,
     seed: int = 0,
 ) -> list[int]:
-    """Lets a policy walk, with sampled actions, and notes the way.
+    """The way of a policy with sampled actions.
 
     Args:
         policy: reads ``state_id``, ``goal_id`` and ``scene_id``, writes ``action``.
@@ -62,29 +59,9 @@ def record_walk(
     Returns:
         global ids of the states on the way, start and end included.
     """
-    env = TargetNavEnv(
-        scenes,
-        goals=[goal],
-        batch_size=[attempts],
-        history=history,
-        max_steps=max_steps,
-        device=scenes.device,
-    )
-    devices = [scenes.device] if scenes.device.type == "cuda" else []
-    with torch.random.fork_rng(devices), set_exploration_type(ExplorationType.RANDOM):
-        torch.manual_seed(seed)
-        walks = env.rollout(
-            max_steps,
-            policy,
-            auto_reset=False,
-            tensordict=env.set_state(start, goal),
-            break_when_all_done=True,
-        )
-    end = walks["next", "done"].squeeze(-1).to(torch.int64).argmax(-1)  # first done of each row
-    arrived = walks["next", "terminated"].squeeze(-1).any(-1)
-    best = int(torch.where(arrived, end, max_steps).argmin()) if bool(arrived.any()) else attempts - 1
-    states = walks["next", "state_id"][best, : int(end[best]) + 1, -1]
-    return [start, *states.tolist()]
+    starts, goals = torch.full((attempts,), start), torch.full((attempts,), goal)
+    ways = trails(policy, scenes, starts, goals, max_steps=max_steps, history=history, seed=seed)
+    return min(ways, key=lambda way: len(way) if way[-1] == goal else max_steps + 2)
 
 
 def draw_film(scenes: SceneSet, trail: Sequence[int], goal: int, scale: int = 2) -> list[Image.Image]:

@@ -6,19 +6,23 @@ import torch
 from vusfa.errors import ResultError
 from vusfa.evaluation import Episodes
 from vusfa.evaluation.exact import ExactGoals
-from vusfa.experiments.results import Cell
-from vusfa.experiments.unseen import unseen_table
+from vusfa.experiments.generalise import unseen_table
+from vusfa.experiments.runs import Run
 
 
-def cell(seed: int, lengths: list[int]) -> Cell:
+def cell(seed: int, lengths: list[int]) -> Run:
     """Two goals of two episodes each, five actions away; 500 is a failure."""
     length = torch.tensor(lengths)
     goal = torch.tensor([3, 3, 8, 8])
     zero = torch.zeros(4, dtype=torch.int64)
     table = Episodes(zero, goal, zero, length < 500, length, zero + 5, zero, zero > 0, ("hall",), 500)
     half = torch.tensor([0.25, 0.5], dtype=torch.float64)
-    walk = ExactGoals(torch.zeros(2).long(), torch.tensor([3, 8]), half, 2 * half, half / 5)
-    return Cell("generalise", f"vusfa-{seed}", {"tested_in": ["hall"]}, {"agent": table}, walk)
+    walk = ExactGoals(
+        torch.zeros(2).long(),
+        torch.tensor([3, 8]),
+        {"success_100": half, "success_500": 2 * half, "spl": half / 5},
+    )
+    return Run("generalise", f"vusfa-{seed}", {"tested_in": ["hall"]}, {"agent": table}, walk)
 
 
 def test_by_hand() -> None:

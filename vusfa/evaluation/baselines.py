@@ -1,4 +1,4 @@
-"""What the results stand between: the random walk below, the shortest path above.
+"""Reference baselines: random walk and shortest path.
 
 On rooms of a few hundred states a random walk meets many goals within 500 steps. A success rate means nothing
 without that number beside it, so it is computed exactly, not sampled.
@@ -16,7 +16,9 @@ from vusfa.evaluation.navigation import Unreachable
 from vusfa.scenes import Scene
 from vusfa.scenes.markov import random_walk_success
 
-__all__ = ["random_walk", "shortest_paths"]
+__all__ = ["RANDOM_WALK", "SHORTEST_PATH", "random_walk", "shortest_paths"]
+
+RANDOM_WALK, SHORTEST_PATH = "random walk", "shortest path"
 
 
 def random_walk(scene: Scene, goals: Tensor, steps: int, unreachable: Unreachable = "skip") -> Tensor:

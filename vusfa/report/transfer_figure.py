@@ -9,7 +9,7 @@ from pathlib import Path
 import torch
 
 from vusfa.evaluation.statistics import Estimate, Sums, bootstrap_mean
-from vusfa.experiments.results import Cell
+from vusfa.experiments.runs import Run
 from vusfa.experiments.transfer import KINDS, area_under, frames_to
 from vusfa.files import replacing
 
@@ -37,13 +37,13 @@ def mean_over(values: Sequence[Sequence[float]]) -> Estimate:
 
 
 def transfer_table(
-    cells: Sequence[Cell], threshold: float, bounds: Mapping[str, Sequence[tuple[float, float]]] | None = None
+    runs: Sequence[Run], threshold: float, bounds: Mapping[str, Sequence[tuple[float, float]]] | None = None
 ) -> str:
     """Markdown: for each kind, model and way the mean length over the training, at its start and end, and the
     frames to a threshold, each with its 95 % interval over seeds and sets of goals.
 
     Args:
-        cells: of the experiment.
+        runs: of the experiment.
         threshold: actions an episode.
         bounds: of each kind, for each set of goals the length of a random walk and of the shortest path, see
             :func:`~vusfa.experiments.transfer.walked_lengths`; a row each below the models.
@@ -54,10 +54,10 @@ def transfer_table(
         f" frames to {threshold:g} | came there |",
         "|---|---|---|---|---|---|---|---|---|",
     ]
-    for kind, model, here in _groups(cells):
+    for kind, model, here in _groups(runs):
         kinds += [] if kind in kinds else [kind]
         for way in WAYS:
-            curves = [[entry[way] for entry in cell.info["curves"]] for cell in here]
+            curves = [[entry[way] for entry in run.info["curves"]] for run in here]
             area = mean_over([[area_under(c["frames"], c["length"]) for c in row] for row in curves])
             first, last = (mean_over([[c["length"][end] for c in row] for row in curves]) for end in (0, -1))
             to = [[frames_to(c["frames"], c["length"], threshold) for c in row] for row in curves]
@@ -75,21 +75,21 @@ def transfer_table(
     return "\n".join(lines)
 
 
-def difference_table(cells: Sequence[Cell]) -> str:
+def difference_table(runs: Sequence[Run]) -> str:
     """Markdown: differences of the mean length over the training, paired by seed and set of goals, with 95 %
     intervals: of each model trained on from the same model from scratch, and of neighbours trained on.
 
     Less than 0: fewer actions than what it is compared with.
 
     Args:
-        cells: of the experiment; of seeds that both sides of a pair have.
+        runs: of the experiment; of seeds that both sides of a pair have.
     """
     areas: dict[tuple[str, str, str], dict[int, list[float]]] = {}
-    for cell in cells:
+    for run in runs:
         for way in WAYS:
-            here = areas.setdefault((cell.info["kind"], cell.info["model"], way), {})
-            curves = [entry[way] for entry in cell.info["curves"]]
-            here[cell.info["seed"]] = [area_under(c["frames"], c["length"]) for c in curves]
+            here = areas.setdefault((run.info["kind"], run.info["model"], way), {})
+            curves = [entry[way] for entry in run.info["curves"]]
+            here[run.info["seed"]] = [area_under(c["frames"], c["length"]) for c in curves]
     lines = [
         "| new goals | trained on | against | seeds | difference, mean of the curve |",
         "|---|---|---|---|---|",
@@ -110,7 +110,7 @@ def difference_table(cells: Sequence[Cell]) -> str:
 
 
 def draw_transfer(
-    cells: Sequence[Cell],
+    runs: Sequence[Run],
     path: str | Path,
     bounds: Mapping[str, Sequence[tuple[float, float]]] | None = None,
 ) -> Path:
@@ -118,13 +118,13 @@ def draw_transfer(
     shortest path in grey (``bounds``, see :func:`transfer_table`); as PNG, atomically."""
     from matplotlib.figure import Figure  # of the extra "recipes"
 
-    kinds = [kind for kind in KINDS if any(cell.info["kind"] == kind for cell in cells)]
+    kinds = [kind for kind in KINDS if any(run.info["kind"] == kind for run in runs)]
     figure = Figure(figsize=(4.2 * len(kinds), 4.6), layout="constrained")
     panels = figure.subplots(1, len(kinds), sharey=True, squeeze=False)[0]
-    for kind, model, here in _groups(cells):
+    for kind, model, here in _groups(runs):
         panel = panels[kinds.index(kind)]
         for way, style in zip(WAYS, ("-", ":"), strict=True):
-            curves = [[entry[way] for entry in cell.info["curves"]] for cell in here]
+            curves = [[entry[way] for entry in run.info["curves"]] for run in here]
             frames = curves[0][0]["frames"]
             points = [
                 mean_over([[c["length"][i] for c in row] for row in curves]) for i in range(len(frames))
@@ -150,12 +150,12 @@ def draw_transfer(
     return Path(path)
 
 
-def _groups(cells: Sequence[Cell]) -> list[tuple[str, str, list[Cell]]]:
-    models = [*_COLOURS, *sorted({cell.info["model"] for cell in cells} - _COLOURS.keys())]
+def _groups(runs: Sequence[Run]) -> list[tuple[str, str, list[Run]]]:
+    models = [*_COLOURS, *sorted({run.info["model"] for run in runs} - _COLOURS.keys())]
     groups = []
     for kind in KINDS:
         for model in models:
-            here = [cell for cell in cells if (cell.info["kind"], cell.info["model"]) == (kind, model)]
+            here = [run for run in runs if (run.info["kind"], run.info["model"]) == (kind, model)]
             if here:
                 groups.append((kind, model, here))
     return groups

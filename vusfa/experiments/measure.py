@@ -1,4 +1,4 @@
-"""From checkpoints to a cell of results: which checkpoint counts, and what it is worth."""
+"""From checkpoints to a run's results: which checkpoint counts, and its evaluation."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from tensordict.nn import TensorDictModuleBase
 
 from vusfa.evaluation import Episodes, evaluate
 from vusfa.evaluation.exact import exact_goals
-from vusfa.evaluation.metrics import spl
+from vusfa.evaluation.metrics import get_metric
 from vusfa.evaluation.tabulated import TabulatedPolicy
 from vusfa.experiments.manifest import BUNDLED_MANIFEST, Manifest, make_manifest, read_manifest
-from vusfa.experiments.results import Cell
+from vusfa.experiments.runs import Run
 from vusfa.modules import ActingPolicy, Agent, sees_one_frame
 from vusfa.scenes import SceneSet
 from vusfa.training import load_agent, make_observation
@@ -31,7 +31,7 @@ __all__ = [
     "walk_manifest",
 ]
 
-WAYS = ("sampled", "greedy")
+MODES = ("sampled", "greedy")
 
 
 def manifest_for(scenes: SceneSet, trained: torch.Tensor, path: Path | None = None) -> Manifest:
@@ -61,7 +61,7 @@ def choose_checkpoint(checkpoints: Sequence[Path], manifest: Path | None = None)
             table = walk_manifest(
                 agent, scenes, episodes, state["goals"], path.stem, validation=True, policy=policy
             )
-        scores[path] = spl(table.success, table.length, table.shortest)
+        scores[path] = get_metric("spl").value(table)
     return dict(sorted(scores.items(), key=lambda item: -item[1]))
 
 
@@ -98,13 +98,13 @@ def evaluation_precision(agent: Agent, config: Mapping[str, Any]) -> AbstractCon
 
 def measure_checkpoint(
     checkpoint: Path, experiment: str, name: str, overrides: Sequence[str] = (), manifest: Path | None = None
-) -> Cell:
-    """A cell: the manifest's episodes with actions drawn and with the likeliest ones, and the exact table
-    where the agent sees one frame.
+) -> Run:
+    """A run's results: the manifest's episodes with actions drawn and with the likeliest ones, and the
+    exact table where the agent sees one frame.
 
     Args:
         checkpoint: of recipes/train.py.
-        experiment, name: of the cell.
+        experiment, name: of the run.
         overrides: what the training was started with.
         manifest: see :func:`manifest_for`.
     """
@@ -113,14 +113,14 @@ def measure_checkpoint(
     policy = evaluation_policy(agent, scenes)
     with evaluation_precision(agent, state["config"]):
         tables = {
-            way: walk_manifest(
-                agent, scenes, episodes, trained, f"{name}, {way}", way == "sampled", policy=policy
+            mode: walk_manifest(
+                agent, scenes, episodes, trained, f"{name}, {mode}", mode == "sampled", policy=policy
             )
-            for way in WAYS
+            for mode in MODES
         }
     exact = exact_goals(policy.probabilities, scenes) if isinstance(policy, TabulatedPolicy) else None
     info = {**run_facts(state, overrides), "checkpoint": checkpoint.name}
-    return Cell(experiment, name, info, tables, exact)
+    return Run(experiment, name, info, tables, exact)
 
 
 def walk_manifest(

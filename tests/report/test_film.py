@@ -12,8 +12,8 @@ from PIL import Image
 
 from vusfa.errors import ConfigError
 from vusfa.evaluation import Episodes, evaluate
-from vusfa.evaluation.curve import plot_curve, read_metrics
-from vusfa.evaluation.film import draw_film, longest_success, record_walk, write_gif
+from vusfa.report.curve import plot_curve, read_metrics
+from vusfa.report.film import draw_film, longest_success, record_walk, write_gif
 from vusfa.scenes import SceneSet
 
 
@@ -80,8 +80,8 @@ def test_no_film_without_pictures():
 def test_the_curve(tmp_path: Path):
     metrics = tmp_path / "metrics.csv"
     metrics.write_text("frames,success,length_ratio\n1000,,\n2000,0.5,4.0\n3000,1.0,1.5\n")
-    assert read_metrics(metrics)["success"][1:] == [0.5, 1.0]
-    with Image.open(plot_curve(metrics, tmp_path / "curve.png", floor=0.4, title="vusfa")) as picture:
+    assert read_metrics(metrics)["success"][1:].tolist() == [0.5, 1.0]
+    with Image.open(plot_curve(metrics, tmp_path / "curve.png", random_walk=0.4, title="vusfa")) as picture:
         assert picture.format == "PNG"
         assert picture.width > 600
         colours = {colour for _, colour in picture.convert("RGB").getcolors(1 << 20)}
@@ -93,4 +93,4 @@ def test_a_run_without_rows_has_no_curve(tmp_path: Path):
         read_metrics(tmp_path / "metrics.csv")
     (tmp_path / "metrics.csv").write_text("frames,success\n")
     with pytest.raises(ConfigError, match="no rows yet"):
-        read_metrics(tmp_path / "metrics.csv")
+        plot_curve(tmp_path / "metrics.csv", tmp_path / "curve.png")

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import csv
-import math
 from pathlib import Path
+
+import numpy as np
 
 from vusfa.errors import ConfigError
 from vusfa.files import replacing
@@ -12,45 +13,52 @@ from vusfa.files import replacing
 __all__ = ["plot_curve", "read_metrics"]
 
 
-def read_metrics(path: str | Path) -> dict[str, list[float]]:
-    """The columns of a run's ``metrics.csv``; an empty field is NaN.
+def read_metrics(path: str | Path) -> dict[str, np.ndarray]:
+    """The columns of a run's ``metrics.csv``, each (n,) float64; an empty field is NaN.
 
     Raises:
-        ConfigError: there is no such file, or it has no rows.
+        ConfigError: there is no such file, or a field is no number.
     """
     path = Path(path)
     if not path.is_file():
-        raise ConfigError(f"{path}: no such file; a run with logger csv writes metrics.csv in its folder")
+        raise ConfigError(f"{path}: no such file; a run writes metrics.csv in its folder")
     with open(path, newline="", encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
-    if not rows:
-        raise ConfigError(f"{path}: no rows yet; train for longer, or log more often (log_every)")
-    return {key: [float(row[key] or math.nan) for row in rows] for key in rows[0]}
+    try:
+        return {
+            name: np.array([float(row[name] or "nan") for row in rows]) for name in (rows[0] if rows else ())
+        }
+    except (TypeError, ValueError) as error:
+        raise ConfigError(f"{path}: {error}; it is to hold numbers alone, see docs/training.md") from error
 
 
-def plot_curve(metrics: str | Path, path: str | Path, floor: float | None = None, title: str = "") -> Path:
+def plot_curve(
+    metrics: str | Path, path: str | Path, random_walk: float | None = None, title: str = ""
+) -> Path:
     """Success and length over shortest path against frames, as PNG, atomically.
 
     Args:
         metrics: the run's ``metrics.csv``.
         path: where to.
-        floor: success of the random walk, drawn as a line.
+        random_walk: its success, drawn as a line.
         title: above the picture.
 
     Raises:
-        ConfigError: see :func:`read_metrics`.
+        ConfigError: see :func:`read_metrics`; or there are no rows.
     """
     from matplotlib.figure import Figure  # of the extra "recipes"
 
     columns = read_metrics(metrics)
-    frames = [f / 1000 for f in columns["frames"]]
+    if not columns:
+        raise ConfigError(f"{metrics}: no rows yet; train for longer, or log more often (log_every)")
+    frames = columns["frames"] / 1000
     figure = Figure(figsize=(7, 4.5), layout="constrained")
     upper, lower = figure.subplots(2, 1, sharex=True)
-    upper.plot(frames, [100 * s for s in columns["success"]], color="#1f61b6")
+    upper.plot(frames, 100 * columns["success"], color="#1f61b6")
     upper.set_ylabel("success in training (%)")
     upper.set_ylim(0, 102)
-    if floor is not None:
-        upper.axhline(100 * floor, color="#888888", linestyle="--", label="random walk")
+    if random_walk is not None:
+        upper.axhline(100 * random_walk, color="#888888", linestyle="--", label="random walk")
         upper.legend(loc="lower right", frameon=False)
     lower.plot(frames, columns["length_ratio"], color="#d6452c")
     lower.axhline(1.0, color="#888888", linestyle="--", label="shortest path")

@@ -5,11 +5,10 @@ from pathlib import Path
 import pytest
 import torch
 
-from vusfa.evaluation import evaluate
-from vusfa.evaluation.metrics import spl
-from vusfa.experiments import cells
-from vusfa.experiments.cells import choose_checkpoint, evaluation_precision, manifest_for, walk_manifest
+from vusfa.evaluation import evaluate, get_metric
+from vusfa.experiments import measure
 from vusfa.experiments.manifest import BUNDLED_MANIFEST
+from vusfa.experiments.measure import choose_checkpoint, evaluation_precision, manifest_for, walk_manifest
 from vusfa.modules import make_agent
 from vusfa.scenes import SceneSet
 
@@ -55,12 +54,12 @@ def test_the_best_on_the_validation_goals_is_chosen(rooms: SceneSet, monkeypatch
         return evaluate(policy, rooms, episodes=(start, goal), max_steps=steps, history=1)
 
     state = {"goals": torch.tensor([3]), "config": {"autocast": True}}
-    monkeypatch.setattr(cells, "walk_manifest", walked)
-    monkeypatch.setattr(cells, "load_agent", lambda path: (agent, rooms, state))
+    monkeypatch.setattr(measure, "walk_manifest", walked)
+    monkeypatch.setattr(measure, "load_agent", lambda path: (agent, rooms, state))
     scores = choose_checkpoint([Path("a.pt"), Path("b.pt"), Path("c.pt")])
     assert [path.stem for path in scores] == ["b", "c", "a"]
     table = walked(*[None] * 4, "b", validation=True)
-    assert scores[Path("b.pt")] == spl(table.success, table.length, table.shortest)  # type: ignore[attr-defined]
+    assert scores[Path("b.pt")] == get_metric("spl").value(table)  # type: ignore[arg-type]
 
 
 def test_a_walk_in_the_precision_of_the_training(rooms: SceneSet) -> None:

@@ -1,0 +1,291 @@
+"""The one long table of results, a pandas frame: one row per run, mode, goal and metric.
+
+Its columns are run, model, seed, scene, goal (state id within its scene), trained (trained on), mode
+(``sampled``, ``greedy`` or ``exact``), metric, numerator, denominator and value. Numerators and denominators
+are sums over the episodes to the goal, so that :func:`pool` is exact for any set of rows. The baselines are
+runs like any other, without a seed (-1).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+
+import numpy as np
+import pandas as pd
+import torch
+from torch import Tensor
+
+from vusfa.evaluation.baselines import RANDOM_WALK, random_walk
+from vusfa.evaluation.episodes import Episodes
+from vusfa.evaluation.exact import ExactGoals
+from vusfa.evaluation.metrics import metrics_within
+from vusfa.evaluation.navigation import Unreachable
+from vusfa.evaluation.statistics import Sums
+from vusfa.scenes import SceneSet
+
+__all__ = [
+    "DISTANCE_BINS",
+    "SUBSETS",
+    "average_over_scenes",
+    "distance_bin",
+    "distance_to_trained",
+    "episode_rows",
+    "exact_rows",
+    "goal_sums",
+    "join_tables",
+    "pool",
+    "random_walk_rows",
+    "row_label",
+    "select_goals",
+]
+
+#: Goals that were trained on, the others, and both.
+SUBSETS = ("trained", "unseen", "all")
+MEAN_OF_SCENES = "mean of scenes"
+MEAN_OF_STATES = "mean of states"
+WITHIN = (500, 100)
+#: Actions from the nearest trained goal: the first number of each bin.
+DISTANCE_BINS = (0, 1, 3, 5, 8, 12)
+
+_SUMMED = ["numerator", "denominator"]
+_NAMES = ["run", "model", "scene", "mode", "metric"]
+
+
+def episode_rows(
+    episodes: Episodes,
+    model: str,
+    *,
+    run: str = "",
+    seed: int = -1,
+    mode: str = "sampled",
+    within: Sequence[int] = WITHIN,
+) -> pd.DataFrame:
+    """The long table of one run's episodes.
+
+    Args:
+        episodes: of one run in one mode.
+        model, run, seed, mode: columns; the run is called like its model where it has no name.
+        within: numbers of actions to give the success within; those above the episodes' limit are left out,
+            and the limit itself is always there.
+
+    >>> one = torch.tensor([1, 1])
+    >>> walks = Episodes(one, one, one, one > 0, one * 150, one * 100, one, one > 0, ("hall", "attic"), 500)
+    >>> table = episode_rows(walks, "vusfa")
+    >>> dict(zip(table.metric, table.value))["length_ratio"]
+    1.5
+    """
+    size = 1 + int(episodes.goal.max()) if len(episodes) else 1
+    keys, index = (episodes.scene * size + episodes.goal).unique(return_inverse=True)
+    trained = torch.zeros(len(keys), dtype=torch.bool)
+    trained[index[episodes.trained]] = True
+    columns = {}
+    for metric in metrics_within(within, episodes.max_steps):
+        parts = metric.parts(episodes)
+        if parts is not None:
+            zeros = torch.zeros(len(keys), dtype=torch.float64)
+            columns[metric.name] = [zeros.index_add(0, index, part.to(torch.float64)) for part in parts]
+    scenes = np.array(episodes.scene_names, dtype=object)[(keys // size).numpy()]
+    return _rows(columns, scenes, keys % size, trained, run or model, model, seed, mode)
+
+
+def exact_rows(
+    exact: ExactGoals,
+    goals: pd.DataFrame,
+    scenes: Sequence[str],
+    model: str,
+    *,
+    run: str = "",
+    seed: int = -1,
+) -> pd.DataFrame:
+    """The long table of exact values, mode ``exact``.
+
+    Args:
+        exact: of all goals.
+        goals: rows with scene, goal and trained; the goals to take.
+        scenes: names, by the index in ``exact``.
+        model, run, seed: columns.
+    """
+    size = 1 + int(max(exact.goal.max(), goals.goal.max()))
+    place = torch.full((len(scenes) * size,), -1)
+    place[exact.scene * size + exact.goal] = torch.arange(len(exact.goal))
+    number = {name: index for index, name in enumerate(scenes)}
+    scene = torch.tensor([number[name] for name in goals.scene])
+    rows = place[scene * size + torch.tensor(goals.goal.to_numpy())]
+    ones = torch.ones(len(rows), dtype=torch.float64)
+    columns = {name: [column[rows].to(torch.float64), ones] for name, column in exact.metrics.items()}
+    goal, trained = (torch.tensor(goals[name].to_numpy()) for name in ("goal", "trained"))
+    return _rows(columns, goals.scene.to_numpy(), goal, trained, run or model, model, seed, "exact")
+
+
+def random_walk_rows(
+    scenes: SceneSet,
+    goals: Tensor,
+    trained: Tensor,
+    max_steps: int = 500,
+    within: Sequence[int] = WITHIN,
+    unreachable: Unreachable = "skip",
+) -> pd.DataFrame:
+    """The long table of the random walk: success alone, computed; goals that no start reaches are left out.
+
+    Args:
+        scenes: the world.
+        goals: (G,) global state ids.
+        trained: global ids of the trained goals.
+        max_steps, within, unreachable: as for the policies that it stands beside.
+    """
+    goals = goals.cpu()
+    scene, local = scenes.scene_id.cpu()[goals], scenes.local_id(goals.to(scenes.scene_id.device)).cpu()
+    names = [metric.name for metric in metrics_within(within, max_steps) if metric.name[:8] == "success_"]
+    found = torch.empty(len(names), len(goals), dtype=torch.float64)
+    for index, room in enumerate(scenes.scenes):
+        here = scene == index
+        for row, name in enumerate(names):
+            found[row, here] = random_walk(room, local[here], int(name[8:]), unreachable)
+    kept = ~found.isnan().any(0)
+    ones = torch.ones(int(kept.sum()), dtype=torch.float64)
+    columns = {name: [row[kept], ones] for name, row in zip(names, found, strict=True)}
+    places = np.array(scenes.names, dtype=object)[scene[kept].numpy()]
+    is_trained = torch.isin(goals[kept], trained.cpu())
+    return _rows(columns, places, local[kept], is_trained, RANDOM_WALK, RANDOM_WALK, -1, "exact")
+
+
+def _rows(
+    columns: Mapping[str, Sequence[Tensor]],
+    scene: np.ndarray,
+    goal: Tensor,
+    trained: Tensor,
+    run: str,
+    model: str,
+    seed: int,
+    mode: str,
+) -> pd.DataFrame:
+    count = len(columns)
+    over, under = (torch.cat([parts[i] for parts in columns.values()]).numpy() for i in (0, 1))
+    with np.errstate(invalid="ignore", divide="ignore"):
+        value = np.where(under > 0, over / under, np.nan)
+    table = pd.DataFrame(
+        {
+            "run": run,
+            "model": model,
+            "seed": seed,
+            "scene": np.tile(scene, count),
+            "goal": np.tile(goal.numpy(), count),
+            "trained": np.tile(trained.numpy(), count),
+            "mode": mode,
+            "metric": np.repeat(list(columns), len(goal)),
+            "numerator": over,
+            "denominator": under,
+            "value": value,
+        }
+    )
+    return join_tables([table])
+
+
+def join_tables(tables: Iterable[pd.DataFrame]) -> pd.DataFrame:
+    """Several long tables as one; names become categories in the order in which they first appear."""
+    table = pd.concat(tables, ignore_index=True)
+    for name in _NAMES:
+        strings = table[name].astype(object)
+        table[name] = pd.Categorical(strings, categories=strings.unique())
+    return table
+
+
+def pool(table: pd.DataFrame, by: Sequence[str]) -> pd.DataFrame:
+    """Sums of numerators and denominators over all rows that agree in ``by``, and their ratio.
+
+    Returns:
+        one row per group, with the columns ``by``, numerator, denominator
+        and value (NaN where the denominator is 0).
+    """
+    groups = table.groupby(list(by), observed=True, sort=True)[_SUMMED]
+    pooled = groups.sum().reset_index()
+    pooled["value"] = (pooled.numerator / pooled.denominator).where(pooled.denominator > 0)
+    return pooled
+
+
+def select_goals(table: pd.DataFrame, subset: str) -> pd.DataFrame:
+    """The rows of one of :data:`SUBSETS`."""
+    return table if subset == "all" else table[table.trained == (subset == "trained")]
+
+
+def average_over_scenes(table: pd.DataFrame, by: Sequence[str]) -> pd.DataFrame:
+    """:func:`pool` per scene and, where there are several scenes, both averages over them.
+
+    The mean of scenes is that of the scenes' values, a scene without a value left out. The mean of states
+    pools all goals. The paper's own table mixes the two.
+
+    Args:
+        table: long.
+        by: columns beside ``scene`` to group by, ``metric`` among them.
+    """
+    scenes = pool(table, [*by, "scene"])
+    if scenes.scene.nunique() < 2:
+        return scenes
+    mean = scenes.groupby(list(by), observed=True, sort=True).value.mean().reset_index()
+    whole = pool(table, by)
+    parts = [scenes, mean.assign(scene=MEAN_OF_SCENES), whole.assign(scene=MEAN_OF_STATES)]
+    return pd.concat([part.assign(scene=part.scene.astype(object)) for part in parts], ignore_index=True)
+
+
+def goal_sums(tables: Sequence[pd.DataFrame], metric: str) -> tuple[Sums, Tensor] | None:
+    """What a metric's mean is made of, per seed and goal.
+
+    Args:
+        tables: K long tables, one per seed, each of one mode.
+        metric: its name.
+
+    Returns:
+        sums (K, G) and a number (G,) for the scene of each goal; None where the seeds have different goals,
+        or none.
+    """
+    parts = [table[table.metric == metric].sort_values(["scene", "goal"]) for table in tables]
+    goals = [list(zip(part.scene, part.goal, strict=True)) for part in parts]
+    if not parts or not goals[0] or any(other != goals[0] for other in goals[1:]):
+        return None
+    over, under = (torch.tensor(np.stack([part[name] for part in parts])) for name in _SUMMED)
+    return Sums(over, under), torch.tensor(pd.factorize(parts[0].scene.astype(object))[0])
+
+
+def distance_to_trained(scenes: SceneSet, scene: Tensor, goal: Tensor, trained: Tensor) -> Tensor:
+    """Fewest actions to each goal from a trained one of its scene, -1 where there is none.
+
+    Args:
+        scenes: the world.
+        scene, goal: (G,) int64.
+        trained: (G,) bool.
+
+    >>> bathroom, goals = SceneSet.bundled(["bathroom"]), torch.arange(4)
+    >>> distance_to_trained(bathroom, goals * 0, goals, goals == 0).tolist()
+    [0, 1, 2, 1]
+    """
+    nearest_one = torch.full_like(goal, -1)
+    for index, room in enumerate(scenes.scenes):
+        here = scene == index
+        sources = goal[here & trained]
+        if sources.numel():
+            table = room.distance[sources][:, goal[here]].to(torch.int64)
+            far = table.max() + 1
+            nearest = torch.where(table < 0, far, table).amin(0)
+            nearest_one[here] = torch.where(nearest == far, -1, nearest)
+    return nearest_one
+
+
+def distance_bin(index: int) -> str:
+    """The actions of a bin of :data:`DISTANCE_BINS` in words.
+
+    >>> [distance_bin(index) for index in range(len(DISTANCE_BINS))]
+    ['0', '1–2', '3–4', '5–7', '8–11', '12 or more']
+    """
+    first, after = DISTANCE_BINS[index], (*DISTANCE_BINS, None)[index + 1]
+    if after is None:
+        return f"{first} or more"
+    return str(first) if after == first + 1 else f"{first}–{after - 1}"
+
+
+def row_label(name: str, architecture: str | None = None) -> str:
+    """What a model is called in tables: its row's name, with its architecture unless that is the usual one.
+
+    >>> row_label("vusfa", "paper"), row_label("vusfa", "controlled")
+    ('vusfa (paper)', 'vusfa')
+    """
+    return name if architecture in (None, "", "controlled") else f"{name} ({architecture})"

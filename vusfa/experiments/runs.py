@@ -1,0 +1,205 @@
+"""Raw results on disk: ``results/EXPERIMENT/RUN/``, from which every table can be computed again.
+
+A run is one trained agent. Its folder holds
+
+``cell.json``    what it is: model, seed, settings, trained goals, frames, seconds, machine, versions
+``NAME.npz``     the episodes of one mode of evaluation (``sampled``, ``greedy``), columns of small integers
+``exact.npz``    where it can be computed, :class:`~vusfa.evaluation.exact.ExactGoals`
+
+The folder appears at once and complete, or not at all.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+import tempfile
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import torch
+from torch import Tensor
+
+from vusfa.deprecated import moved_names
+from vusfa.errors import ResultError
+from vusfa.evaluation.episodes import Episodes
+from vusfa.evaluation.exact import ExactGoals
+from vusfa.evaluation.long_table import episode_rows, exact_rows, join_tables, row_label
+from vusfa.files import read_npz, write_json
+
+__all__ = ["Run", "read_run", "read_runs", "write_run"]
+
+_EXACT = "exact"
+_EPISODES = ("scene", "goal", "start", "success", "length", "shortest", "collisions", "trained")
+
+
+@dataclass(frozen=True, eq=False)
+class Run:
+    """The results of one trained agent.
+
+    Attributes:
+        experiment, name: its folder.
+        info: plain data, as in cell.json.
+        episodes: tables by mode of evaluation.
+        exact: goal by goal, or None.
+    """
+
+    experiment: str
+    name: str
+    info: Mapping[str, Any]
+    episodes: Mapping[str, Episodes]
+    exact: ExactGoals | None = None
+
+    @property
+    def seed(self) -> int:
+        """Seed of the training."""
+        return int(self.info.get("seed") or 0)
+
+    @property
+    def label(self) -> str:
+        """What its model is called in tables."""
+        name = str(self.info.get("row") or self.info.get("model") or self.name)
+        return row_label(name, self.info.get("architecture", self.info.get("agent_preset")))
+
+    def rows(self, goals: pd.DataFrame | None = None) -> pd.DataFrame:
+        """Its long table, see :mod:`vusfa.evaluation.long_table`.
+
+        Args:
+            goals: rows with scene, goal and trained of the exact values; those of the episodes when not
+                given.
+        """
+        head: Any = {"model": self.label, "run": f"{self.experiment}/{self.name}", "seed": self.seed}
+        tables = [episode_rows(table, mode=mode, **head) for mode, table in self.episodes.items()]
+        if self.exact is not None:
+            goals = tables[0][["scene", "goal", "trained"]].drop_duplicates() if goals is None else goals
+            names = next(iter(self.episodes.values())).scene_names
+            tables.append(exact_rows(self.exact, goals, names, **head))
+        return join_tables(tables)
+
+
+def write_run(root: str | Path, run: Run) -> Path:
+    """Write a run's folder; one of the same name is replaced.
+
+    Raises:
+        ResultError: a mode of evaluation is called ``exact``, or no file's name.
+
+    >>> import tempfile
+    >>> with tempfile.TemporaryDirectory() as root:
+    ...     _ = write_run(root, Run("table1", "walk", {"model": "random walk"}, {}))
+    ...     read_run(root, "table1", "walk").info
+    {'model': 'random walk'}
+    """
+    for name in run.episodes:
+        if name == _EXACT or not name.replace("-", "_").isidentifier():
+            raise ResultError(f"episodes are called {name!r}; give a name of letters, digits and -")
+    folder = Path(root) / run.experiment / run.name
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    unfinished = Path(tempfile.mkdtemp(prefix=f".{run.name}.", dir=folder.parent))
+    try:
+        unfinished.chmod(0o755)
+        tables = {name: (table.scene_names, table.max_steps) for name, table in run.episodes.items()}
+        if len(set(tables.values())) > 1:
+            raise ResultError(f"the episodes of {folder} are of different scenes or lengths")
+        scenes, steps = next(iter(tables.values()), ((), 0))
+        facts = {"scenes": list(scenes), "max_steps": steps, "episodes": list(tables)} if tables else {}
+        write_json(unfinished / "cell.json", {"info": dict(run.info), **facts})
+        for name, table in run.episodes.items():
+            columns = {column: getattr(table, column) for column in table.columns}
+            _write_columns(unfinished / f"{name}.npz", columns)
+        if run.exact is not None:
+            exact = {"scene": run.exact.scene, "goal": run.exact.goal, **run.exact.metrics}
+            _write_columns(unfinished / f"{_EXACT}.npz", exact)
+        if folder.exists():
+            shutil.rmtree(folder)
+        unfinished.rename(folder)
+    finally:
+        shutil.rmtree(unfinished, ignore_errors=True)
+    return folder
+
+
+def read_run(root: str | Path, experiment: str, name: str) -> Run:
+    """Read a run's folder.
+
+    Raises:
+        ResultError: something is missing or damaged; the file is named.
+    """
+    folder = Path(root) / experiment / name
+    path = folder / "cell.json"
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+        info, modes = content["info"], content.get("episodes", [])
+        scenes, steps = tuple(content.get("scenes", ())), int(content.get("max_steps", 0))
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise ResultError(
+            f"{path}: cannot be read ({error!r}); delete the folder and run it again"
+        ) from error
+    episodes = {
+        mode: Episodes(
+            **_read_columns(folder / f"{mode}.npz", _EPISODES), scene_names=scenes, max_steps=steps
+        )
+        for mode in modes
+    }
+    return Run(experiment, name, info, episodes, _read_exact(folder / f"{_EXACT}.npz"))
+
+
+def _read_exact(path: Path) -> ExactGoals | None:
+    if not path.exists():
+        return None
+    columns = _read_columns(path, ["scene", "goal"])
+    scene, goal = columns.pop("scene"), columns.pop("goal")
+    return ExactGoals(scene, goal, columns)
+
+
+def read_runs(root: str | Path, experiment: str) -> list[Run]:
+    """All runs of an experiment, by name; none where there is no such folder.
+
+    Raises:
+        ResultError: see :func:`read_run`.
+    """
+    folder = Path(root) / experiment
+    names = sorted(path.parent.name for path in folder.glob("*/cell.json") if path.parent.name[0] != ".")
+    return [read_run(root, experiment, name) for name in names]
+
+
+def _write_columns(path: Path, columns: Mapping[str, Tensor]) -> None:
+    small = {name: _small(column.numpy()) for name, column in columns.items()}
+    np.savez_compressed(path, allow_pickle=False, **small)
+
+
+def _small(column: np.ndarray) -> np.ndarray:
+    """In the smallest type that holds the numbers; chances to seven digits."""
+    if column.dtype.kind == "f":
+        return column.astype(np.float32)
+    if column.dtype.kind == "b" or not column.size:
+        return column
+    return column.astype(np.result_type(np.min_scalar_type(column.min()), np.min_scalar_type(column.max())))
+
+
+def _read_columns(path: Path, required: Sequence[str]) -> dict[str, Tensor]:
+    content = read_npz(path)
+    missing = [name for name in required if name not in content]
+    if missing:
+        raise ResultError(f"{path}: the column {missing[0]!r} is missing; run it again")
+    types = {"b": torch.bool, "f": torch.float64}
+    return {
+        name: torch.from_numpy(np.ascontiguousarray(column)).to(types.get(column.dtype.kind, torch.int64))
+        for name, column in content.items()
+    }
+
+
+__getattr__ = moved_names(
+    __name__,
+    {
+        old: f"{__name__}.{new}"
+        for old, new in (
+            ("Cell", "Run"),
+            ("read_cell", "read_run"),
+            ("read_cells", "read_runs"),
+            ("write_cell", "write_run"),
+        )
+    },
+)
