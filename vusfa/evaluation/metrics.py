@@ -211,7 +211,7 @@ def length_ratio(episodes: Episodes) -> tuple[Tensor, Tensor]:
 @register_metric(
     "collisions",
     label="collisions",
-    short="bumps",
+    short="bump",
     title="Blocked actions per episode",
     higher_is_better=False,
 )
