@@ -15,12 +15,11 @@ from omegaconf import DictConfig, OmegaConf
 from tensordict import TensorDictBase
 
 from benchmarks.report import Options
-from vusfa.conf import FOLDER as CONF
+from vusfa.cli.launch import compose
 from vusfa.scenes import SceneSet
 from vusfa.training import Trainer, make_trainer
-from vusfa.training.launch import compose
 
-__all__ = ["CONF", "Running", "recipe_settings", "running", "small"]
+__all__ = ["Running", "recipe_settings", "running", "small"]
 
 
 def recipe_settings(overrides: Sequence[str] = ()) -> DictConfig:
@@ -29,7 +28,7 @@ def recipe_settings(overrides: Sequence[str] = ()) -> DictConfig:
     >>> recipe_settings(["agent.history=1"]).agent.history
     1
     """
-    cfg = compose(CONF, "train", list(overrides))
+    cfg = compose(overrides=overrides)
     OmegaConf.resolve(cfg)
     return cfg
 

@@ -8,28 +8,27 @@ walk.gif, curve.png.
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
-from omegaconf import DictConfig
-
-from vusfa.conf import FOLDER as CONF
+from vusfa.cli.launch import launch
 from vusfa.evaluation.baselines import RANDOM_WALK
 from vusfa.experiments.training import train
 from vusfa.report.curve import plot_curve
 from vusfa.report.film import draw_film, longest_success, record_walk, write_gif
-from vusfa.training.launch import launch
 
 
-def demo(cfg: DictConfig, overrides: list[str]) -> int:
+def demo(settings: dict[str, Any], overrides: list[str]) -> int:
     """Trains as recipes/train.py does; then the film and the curve."""
-    trainer, result, exit_code = train(cfg, overrides)
+    trainer, result, exit_code = train(settings, overrides)
     if result is None:
         return exit_code
-    folder, agent, scenes = Path(cfg.folder), trainer.agent.eval(), trainer.scenes
-    made, within = [], f"success_{cfg.evaluation.max_steps}"
+    folder, agent, scenes = Path(settings["folder"]), trainer.agent.eval(), trainer.scenes
+    made, within = [], f"success_{settings['evaluation']['max_steps']}"
     if (folder / "metrics.csv").is_file():  # nothing is logged when there was nothing left to train
         rows = [row for row in result.rows if (row["policy"], row["goals"]) == (RANDOM_WALK, "trained")]
         random_walk = rows[0][within] if rows else None
-        made.append(plot_curve(folder / "metrics.csv", folder / "curve.png", random_walk, cfg.agent.model))
+        model = settings["agent"]["model"]
+        made.append(plot_curve(folder / "metrics.csv", folder / "curve.png", random_walk, model))
     found = longest_success(result.episodes, scenes)
     if found is not None:
         start, goal = found
@@ -41,4 +40,4 @@ def demo(cfg: DictConfig, overrides: list[str]) -> int:
 
 
 if __name__ == "__main__":
-    launch(demo, CONF, "demo")
+    launch(demo, name="demo")

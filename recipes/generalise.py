@@ -17,6 +17,7 @@ import torch
 import tyro
 from omegaconf import OmegaConf
 
+from vusfa.cli.launch import compose
 from vusfa.errors import SceneError, VusfaError
 from vusfa.evaluation import Episodes, evaluate, print_summary, random_walk_summary, summary
 from vusfa.evaluation.exact import exact_goals, uniform_probabilities
@@ -25,7 +26,6 @@ from vusfa.experiments.runs import Run, read_runs, write_run
 from vusfa.modules import ActingPolicy, TriedActions, transplant
 from vusfa.scenes import SceneSet
 from vusfa.training import EvaluationProgress, load_agent, run_facts
-from vusfa.training.launch import compose
 
 sys.path.insert(0, str(Path(__file__).parent))
 from train import train

@@ -16,12 +16,12 @@ from pathlib import Path
 import tyro
 from omegaconf import OmegaConf, open_dict
 
+from vusfa.cli.launch import compose
 from vusfa.errors import VusfaError
 from vusfa.experiments.measure import choose_checkpoint, measure_checkpoint
 from vusfa.experiments.runs import read_run, write_run
 from vusfa.files import replacing
 from vusfa.modules.presets import MODELS
-from vusfa.training.launch import compose
 
 sys.path.insert(0, str(Path(__file__).parent))
 from train import train

@@ -8,20 +8,18 @@ recipes/train.py resume=RUN/checkpoint.pt
 from __future__ import annotations
 
 import sys
+from typing import Any
 
-from omegaconf import DictConfig
-
-from vusfa.conf import FOLDER as CONF
+from vusfa.cli.launch import launch
 from vusfa.experiments.training import train
-from vusfa.training.launch import launch
 
 
-def main(cfg: DictConfig, overrides: list[str]) -> int:
+def main(settings: dict[str, Any], overrides: list[str]) -> int:
     """Trains and evaluates, and says where the results are."""
-    exit_code = train(cfg, overrides).exit_code
-    print(f"{cfg.folder}/checkpoint.pt", file=sys.stderr)
+    exit_code = train(settings, overrides).exit_code
+    print(f"{settings['folder']}/checkpoint.pt", file=sys.stderr)
     return exit_code
 
 
 if __name__ == "__main__":
-    launch(main, CONF, "train")
+    launch(main)

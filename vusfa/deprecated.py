@@ -29,6 +29,8 @@ MOVED_MODULES: dict[str, str] = {
     "vusfa.evaluation.unseen": "vusfa.experiments.generalise",
     "vusfa.scenes.faults": "vusfa.scenes.validation",
     "vusfa.training.cells": "vusfa.experiments.measure",
+    "vusfa.training.checks": "vusfa.conf.schema",
+    "vusfa.training.launch": "vusfa.cli.launch",
     "vusfa.training.learning": "vusfa.training.optimization",
     "vusfa.training.replay": "vusfa.algorithms.replay",
     "vusfa.training.session": "vusfa.training.trainer",

@@ -69,8 +69,8 @@ class BareTraining:
     def __init__(self, trainer: Trainer) -> None:
         cfg = trainer.settings
         self.optim, self.objective, self.entropy = cfg["optim"], cfg["objective"], cfg["entropy"]
-        if self.optim["kind"] != "adam" or self.objective["n_steps"] is not None:
-            raise ValueError("BareTraining knows optim.kind=adam and objective.n_steps=null alone")
+        if self.optim["kind"] != "adam":
+            raise ValueError("BareTraining knows optim.kind=adam alone")
         env = cfg["env"]
         self.net = BareNetwork(trainer.agent, half=cfg["autocast"])
         self.params = list(self.net.params.values())

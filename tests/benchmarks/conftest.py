@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from vusfa.training.launch import compose  # noqa: F401  (Hydra is needed: say so here, not in each test)
+from vusfa.cli.launch import compose  # noqa: F401  (Hydra is needed: say so here, not in each test)
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
 

@@ -8,13 +8,13 @@ import pytest
 import torch
 from omegaconf import OmegaConf
 
+from vusfa.cli.launch import compose
 from vusfa.conf import FOLDER as CONF
 from vusfa.evaluation import evaluate, get_metric
 from vusfa.experiments.fine_tune import fine_tune, fine_tuning_settings
 from vusfa.modules import ActingPolicy
 from vusfa.scenes import SceneSet
 from vusfa.training import load_agent, make_trainer
-from vusfa.training.launch import compose
 
 
 @pytest.fixture

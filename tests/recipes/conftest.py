@@ -11,8 +11,8 @@ from typing import Any
 import pytest
 from omegaconf import DictConfig, OmegaConf
 
+from vusfa.cli.launch import compose
 from vusfa.conf import FOLDER as CONF
-from vusfa.training.launch import compose
 
 RECIPES = Path(__file__).parents[2] / "recipes"
 

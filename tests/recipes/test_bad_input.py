@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 import torch
 
+from vusfa.cli.launch import launch
 from vusfa.conf import FOLDER as CONF
 from vusfa.scenes import Scene
-from vusfa.training.launch import launch
 
 RECIPES = Path(__file__).parents[2] / "recipes"
 
@@ -123,14 +123,20 @@ def test_an_unknown_scene(run):
         ("+optim.foo=1", "no setting is called 'optim.foo'"),
         ("+evaluation.foo=1", "no setting is called 'evaluation.foo'"),
         ("+logger.foo=1", "no setting is called 'logger.foo'"),
-        ("+agent.histroy=1", "no field 'histroy'; did you mean 'history'?"),
+        ("+agent.histroy=1", "no setting is called 'agent.histroy'; did you mean 'agent.history'?"),
         ("+optim.options.foo=1", "optim.kind=adam does not take"),
         ("log_every=0", "log_every is 0; it must be more than 0"),
         ("checkpoint_every=-5", "checkpoint_every is -5; it must be more than 0"),
         ("optim.horizon=0", "optim.horizon is 0; it must be more than 0"),
         ("entropy.horizon=-1", "entropy.horizon is -1; it must be more than 0"),
-        ("objective.n_steps=abc", "objective.n_steps is 'abc'; it must be a whole number or null"),
-        ("objective.bottleneck_maximum=abc", "objective.bottleneck_maximum is 'abc'; it must be a number"),
+        ("agent.shared_heads=off", "agent.shared_heads is 'off'; it must be true or false"),
+        ("agent.shared_heads=no", "agent.shared_heads is 'no'; it must be true or false"),
+        ("objective.normalize_advantage=1", "objective.normalize_advantage is 1; it must be true or false"),
+        ("autocast=off", "autocast is 'off'; give true, false or auto"),
+        ("agent.history=abc", "agent.history is 'abc'; it must be a whole number, such as 1 or null"),
+        ("algorithm=hindsite", "algorithm=hindsite: there is no such choice; did you mean 'hindsight'?"),
+        ("+algorithm.foo=1", "no setting is called 'algorithm.foo'"),
+        ("objective.terms.rewart=1", "no setting is called 'objective.terms.rewart'; did you mean"),
         ("env.collision_reward=abc", "env.collision_reward is 'abc'; it must be a number or null"),
         ("agent.initial_scale=abc", "agent.initial_scale is 'abc'; it must be a number"),
         ("scenes=null", "scenes is null; it must be a list, such as [bathroom"),

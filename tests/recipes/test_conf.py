@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 from omegaconf import OmegaConf
 
+from vusfa.cli.launch import compose
 from vusfa.conf import FOLDER as CONF
-from vusfa.training.launch import compose
 
 RECIPES = Path(__file__).parents[2] / "recipes"
 FILES = sorted(CONF.rglob("*.yaml"))
@@ -34,7 +34,6 @@ def test_every_file_opens_with_the_line_that_launches_it(path: Path):
 def test_the_groups_mirror_the_package():
     assert {path.name for path in CONF.iterdir() if path.is_dir() and path.name != "__pycache__"} == {
         "agent",
-        "algorithm",
         "collector",
         "env",
         "evaluation",
@@ -60,7 +59,7 @@ def test_the_published_numbers(
     settings, preset: str, model: str, num_envs: int, total_frames: int, successor: float
 ):
     cfg = settings(f"preset={preset}", f"agent.model={model}")
-    assert cfg.agent.preset == preset
+    assert cfg.agent.architecture == preset
     assert (cfg.collector.num_envs, cfg.collector.rollout, cfg.total_frames) == (num_envs, 5, total_frames)
     optim = cfg.optim
     assert (optim.kind, optim.lr, optim.horizon, optim.max_grad_norm) == (
@@ -76,7 +75,7 @@ def test_the_published_numbers(
     assert (cfg.entropy.start, cfg.entropy.horizon) == (0.05, None)
     assert (objective.successor_coeff, objective.gamma, objective.lmbda) == (successor, 0.99, 1.0)
     assert (objective.bottleneck_coeff, objective.bottleneck_step_size) == (0.0, 1e-6)
-    assert (objective.information_target, objective.loss_critic_type) == (0.2, "l2")
+    assert objective.information_target == 0.2
     assert objective.normalize_advantage is False
     assert objective.bootstrap_at_timeout is (preset == "paper")
     assert (cfg.env.goal_reward, cfg.env.step_reward, cfg.env.collision_reward) == (1.0, -0.01, None)
@@ -105,7 +104,7 @@ def test_fast_is_controlled_but_for_the_clock(settings):
         if key not in ("agent", "optim"):
             assert fast[key] == controlled[key]
     assert {key for key in fast.agent if fast.agent[key] != controlled.agent[key]} == {"history"}
-    assert (fast.agent.preset, fast.agent.history, fast.agent.hidden_size) == ("controlled", 1, 256)
+    assert (fast.agent.architecture, fast.agent.history, fast.agent.hidden_size) == ("controlled", 1, 256)
     assert {key for key in fast.optim if fast.optim[key] != controlled.optim[key]} == {"lr"}
     assert fast.optim.lr == 1e-3
 

@@ -31,7 +31,7 @@ def test_the_demo_leaves_a_film_a_curve_and_tables(
 
 def test_its_settings_are_the_bathrooms_five_goals(settings):
     cfg = settings(name="demo")
-    assert (list(cfg.scenes), cfg.env.goals, cfg.agent.model, cfg.agent.preset) == (
+    assert (list(cfg.scenes), cfg.env.goals, cfg.agent.model, cfg.agent.architecture) == (
         ["bathroom"],
         "paper",
         "vusfa",

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
+from vusfa.cli.launch import compose
 from vusfa.conf import FOLDER as CONF
-from vusfa.training.launch import compose
 
 ROOT = Path(__file__).parents[2]
 PAGES = [path for path in (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))) if path.is_file()]

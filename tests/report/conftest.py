@@ -14,11 +14,11 @@ import pytest
 import torch
 from omegaconf import OmegaConf
 
+from vusfa.cli.launch import compose
 from vusfa.conf import FOLDER as CONF
 from vusfa.evaluation import Episodes
 from vusfa.report import Options, read_run, write_report
 from vusfa.report.runs import LoggedRun
-from vusfa.training.launch import compose
 
 RECIPES = Path(__file__).parents[2] / "recipes"
 

@@ -11,7 +11,7 @@ from vusfa.training import machine_facts, run_facts
 def test_facts_of_a_checkpoint() -> None:
     state: dict[str, Any] = {
         "config": {
-            "agent": {"model": "usfa", "preset": "paper"},
+            "agent": {"model": "usfa", "architecture": "paper"},
             "hindsight": {"updates": 0},
             "seed": 4,
             "threads": 1,

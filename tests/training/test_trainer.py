@@ -10,10 +10,10 @@ import pytest
 import torch
 from omegaconf import OmegaConf
 
+from vusfa.cli.launch import compose
 from vusfa.conf import FOLDER as CONF
 from vusfa.errors import ConfigError, VusfaError
 from vusfa.training import Trainer, make_trainer
-from vusfa.training.launch import compose
 
 SMALL = [
     "env.goals=[3,9,12]",

@@ -12,6 +12,7 @@ from typing import Any, TypeVar
 from torchrl.objectives import LossModule
 
 from vusfa.algorithms.base import Algorithm
+from vusfa.conf import settings
 from vusfa.errors import ConfigError
 from vusfa.modules import Agent
 from vusfa.scenes import SceneSet
@@ -40,17 +41,18 @@ def register_algorithm(name: str) -> Callable[[AlgorithmClass], AlgorithmClass]:
 
     def register(algorithm: AlgorithmClass) -> AlgorithmClass:
         ALGORITHMS[name] = algorithm
+        settings.ALGORITHMS[name] = algorithm.Settings(name)
         return algorithm
 
     return register
 
 
-def make_algorithm(name: str, agent: Agent, scenes: SceneSet, settings: Mapping[str, Any]) -> Algorithm:
+def make_algorithm(name: str, agent: Agent, scenes: SceneSet, all_settings: Mapping[str, Any]) -> Algorithm:
     """An algorithm by name.
 
     Args:
         name: that it is registered under.
-        agent, scenes, settings: of :class:`~vusfa.algorithms.Algorithm`.
+        agent, scenes, all_settings: of :class:`~vusfa.algorithms.Algorithm`.
 
     Raises:
         ConfigError: an unknown name, or settings that the algorithm does not fit.
@@ -62,7 +64,7 @@ def make_algorithm(name: str, agent: Agent, scenes: SceneSet, settings: Mapping[
     """
     if name not in ALGORITHMS:
         raise ConfigError(f"algorithm {name!r} is not registered; {_near(name, ALGORITHMS)}")
-    return ALGORITHMS[name](agent, scenes, settings)
+    return ALGORITHMS[name](agent, scenes, all_settings)
 
 
 def register_loss_term(name: str, make: Callable[[Agent, float], LossModule]) -> None:
@@ -74,6 +76,7 @@ def register_loss_term(name: str, make: Callable[[Agent, float], LossModule]) ->
             the coefficient. A :class:`~torchrl.objectives.LossModule` with these arguments will do.
     """
     LOSS_TERMS[name] = make
+    settings.LOSS_TERMS[name] = 0.0
 
 
 def make_loss_terms(agent: Agent, coefficients: Mapping[str, float]) -> list[LossModule]:

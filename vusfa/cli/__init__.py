@@ -11,7 +11,7 @@ import signal
 import sys
 from collections.abc import Sequence
 
-__all__ = ["COMMANDS", "main"]
+__all__ = ["COMMANDS", "TRAINING_COMMANDS", "main"]
 
 #: Modules that add commands, in the order in which ``--help`` shows them. A new command is a module with a
 #: function ``register(scenes)``, and a line here.
@@ -24,6 +24,9 @@ COMMANDS = [
     "vusfa.cli.render",
     "vusfa.cli.compact",
 ]
+
+#: Modules that add a command to ``vusfa`` itself, with a function ``register(app)``.
+TRAINING_COMMANDS = ["vusfa.cli.train"]
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

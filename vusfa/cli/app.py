@@ -9,7 +9,7 @@ import typer
 from typer.core import TyperGroup
 
 from vusfa import __version__
-from vusfa.cli import COMMANDS
+from vusfa.cli import COMMANDS, TRAINING_COMMANDS
 from vusfa.errors import VusfaError
 
 __all__ = ["app", "scenes"]
@@ -59,5 +59,7 @@ def _vusfa(
     """Target-driven visual navigation with universal successor features."""
 
 
+for _name in TRAINING_COMMANDS:
+    import_module(_name).register(app)
 for _name in COMMANDS:
     import_module(_name).register(scenes)

@@ -31,11 +31,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from vusfa.conf.settings import flat
 from vusfa.errors import CheckpointError
 from vusfa.files import replacing
 from vusfa.modules import Agent, make_agent
 from vusfa.scenes import SceneSet, bundled_names
-from vusfa.training.loggers import flat
 from vusfa.training.upgrade import upgrade
 
 __all__ = [
@@ -91,9 +91,7 @@ def load_checkpoint(path: str | Path, device: torch.device | str = "cpu") -> dic
     """
     path = Path(path)
     if not os.path.isfile(path):  # Path.is_file raises in a folder that may not be looked into
-        raise CheckpointError(
-            f"{path}: no such checkpoint; recipes/train.py writes them as RUN/checkpoint.pt"
-        )
+        raise CheckpointError(f"{path}: no such checkpoint; vusfa train writes RUN/checkpoint.pt")
     try:
         state = torch.load(path, map_location=device, weights_only=True)
     except Exception as error:  # of other files the unpickler raises anything, an IndexError for one
@@ -104,7 +102,7 @@ def load_checkpoint(path: str | Path, device: torch.device | str = "cpu") -> dic
     missing = [key for key in _ENTRIES if not isinstance(state, dict) or key not in state]
     if missing:
         raise CheckpointError(
-            f"{path}: no checkpoint of vusfa ({missing[0]!r} is missing); give one of recipes/train.py"
+            f"{path}: no checkpoint of vusfa ({missing[0]!r} is missing); give one of vusfa train"
         )
     if state.get("format") == 1:
         state = upgrade(state)

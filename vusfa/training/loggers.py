@@ -13,10 +13,11 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Protocol
 
+from vusfa.conf.settings import flat
 from vusfa.errors import ConfigError
 from vusfa.files import write_csv, write_json
 
-__all__ = ["CSVLogger", "Logger", "Loggers", "TensorBoardLogger", "WandbLogger", "flat", "make_loggers"]
+__all__ = ["CSVLogger", "Logger", "Loggers", "TensorBoardLogger", "WandbLogger", "make_loggers"]
 
 
 class Logger(Protocol):
@@ -300,21 +301,6 @@ def make_loggers(
         except ImportError as error:
             raise ConfigError(f"logger {kind} needs {error.name}; pip install 'vusfa[recipes]'") from error
     return Loggers(loggers)
-
-
-def flat(config: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Nested settings as one level with dotted names.
-
-    >>> flat({"optim": {"lr": 0.1}, "seed": 1})
-    {'optim.lr': 0.1, 'seed': 1}
-    """
-    result: dict[str, Any] = {}
-    for key, value in config.items():
-        if isinstance(value, Mapping):
-            result |= flat(value, f"{prefix}{key}.")
-        else:
-            result[f"{prefix}{key}"] = value
-    return result
 
 
 def _markdown(rows: Sequence[Mapping[str, Any]]) -> str:

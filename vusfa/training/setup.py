@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import Any
@@ -15,10 +16,12 @@ from vusfa.algorithms import Algorithm, make_algorithm
 from vusfa.envs import SceneObservation, resolve_goals
 from vusfa.errors import ConfigError
 from vusfa.modules import Agent, StateGoalPairs, make_agent, sees_one_frame
+from vusfa.modules.presets import AgentConfig
 from vusfa.scenes import SceneSet
 from vusfa.training.collectors import check_goals_dealt, make_collector, make_env
 from vusfa.training.memory import keep_memory
 from vusfa.training.optimization import make_optimizer
+from vusfa.training.precision import resolve_autocast
 from vusfa.training.trainer import Trainer
 from vusfa.training.upgrade import upgrade_config
 
@@ -46,8 +49,7 @@ def make_trainer(
     scenes = SceneSet.open(settings["scenes"]) if scenes is None else scenes
     goals = resolve_goals(scenes, settings["env"]["goals"])
     check_goals_dealt(len(goals), settings["collector"]["num_envs"], settings["env"]["goal_sampling"])
-    chosen = {key: value for key, value in settings["agent"].items() if value is not None}
-    agent = make_agent(scenes=scenes, **chosen).to(device)
+    agent = make_agent(scenes=scenes, **_given(settings["agent"])).to(device)
     algorithm = make_algorithm(settings["algorithm"]["name"], agent, scenes, settings)
     optimizer = make_optimizer(
         algorithm.parameters(), optim["kind"], optim["lr"], optim["max_grad_norm"], **optim["options"]
@@ -63,7 +65,7 @@ def make_trainer(
             make_env=env,
             policy=policy,
             seed=settings["seed"],
-            autocast=settings["autocast"],
+            autocast=resolve_autocast(settings["autocast"], device),
             **settings["collector"],
         )
 
@@ -96,6 +98,15 @@ def _pairs(
     pairs = StateGoalPairs(algorithm.scenes, goals)
     frames = collector["num_envs"] * collector["rollout"]
     return pairs if len(pairs) <= PAIRS_PER_FRAME * frames else None
+
+
+def _given(agent: Mapping[str, Any]) -> dict[str, Any]:
+    """Arguments of make_agent, without those that the architecture decides on."""
+    given = {key: value for key, value in agent.items() if value is not None}
+    fields = {field.name for field in dataclasses.fields(AgentConfig)}
+    old = {"architecture": "preset", "normalize_features": "normalise_features"}
+    old |= {"normalize_embedding": "normalise_embedding"}
+    return {key if key in fields else old.get(key, key): value for key, value in given.items()}
 
 
 def make_observation(agent: Agent, scenes: SceneSet, crop: str = "first") -> SceneObservation | None:

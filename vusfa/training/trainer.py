@@ -38,6 +38,7 @@ from vusfa.training.collectors import collector_state, load_collector_state, ope
 from vusfa.training.loggers import Logger
 from vusfa.training.metrics import EpisodeMeter, MeanMeter
 from vusfa.training.optimization import descend, total_loss
+from vusfa.training.precision import resolve_autocast
 from vusfa.training.progress import ProgressLine
 from vusfa.training.random_state import random_state, restore_random_state
 from vusfa.training.signals import StopOnSignal
@@ -275,8 +276,9 @@ class Trainer:
         return differences(state["config"], self.settings)
 
     def _precision(self) -> AbstractContextManager:
-        device = next(self.agent.parameters()).device.type
-        return torch.autocast(device, torch.bfloat16, enabled=self.settings["autocast"])
+        device = next(self.agent.parameters()).device
+        enabled = resolve_autocast(self.settings["autocast"], device)
+        return torch.autocast(device.type, torch.bfloat16, enabled=enabled)
 
     def _next(self, batches: Iterator[TensorDictBase]) -> TensorDictBase:
         with self._precision(), ExitStack() as stack:

@@ -5,7 +5,37 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from vusfa.errors import CheckpointError
+
 __all__ = ["upgrade", "upgrade_config"]
+
+
+_RENAMED = {"preset": "architecture", "normalise_features": "normalize_features"}
+# settings of version 0.1 that no preset and no document set, with the values that this version has for all
+_DROPPED: dict[str, dict[str, Any]] = {
+    "agent": {"successor_gain": 1.0},
+    "objective": {
+        "bottleneck_maximum": None,
+        "information_reduction": "mean",
+        "loss_critic_type": "l2",
+        "n_steps": None,
+        "embedding_at": "next",
+    },
+}
+
+# version 0.1 had no numbers of hindsight in the settings of a training without it
+_HINDSIGHT = {
+    "updates": 10,
+    "batch_size": 8192,
+    "capacity": 1_000_000,
+    "horizon": 30,
+    "own_future": 0.5,
+    "critic_coeff": 100.0,
+    "objective_coeff": 1.0,
+    "expectile": 0.7,
+    "temperature": 0.02,
+    "max_weight": 10.0,
+}
 
 
 def upgrade(state: Mapping[str, Any]) -> dict[str, Any]:
@@ -31,9 +61,20 @@ def upgrade_config(config: Mapping[str, Any]) -> dict[str, Any]:
      'algorithm': {'name': 'hindsight'}}
     """
     new = {key: dict(value) if isinstance(value, Mapping) else value for key, value in config.items()}
+    agent = new.get("agent", {})
+    for old, name in _RENAMED.items():
+        if old in agent:
+            agent[name] = agent.pop(old)
+    for group, names in _DROPPED.items():
+        for name, default in names.items():
+            value = new.get(group, {}).pop(name, default)
+            if value is not None and value != default:
+                raise CheckpointError(f"trained with {group}.{name}={value}, which only version 0.1 has")
     if "terms" not in new.get("objective", {"terms": {}}):
         new["objective"]["terms"] = {"reward": new["objective"].pop("reward_coeff", 0.0)}
     hindsight = bool(new.get("hindsight", {}).get("updates", 0))
+    if not hindsight and "hindsight" in new and "algorithm" not in new:
+        new["hindsight"] = dict(_HINDSIGHT)
     autoencoder = new.get("agent", {}).get("pretrained") == "autoencoder"
     name = "hindsight" if hindsight else "autoencoder" if autoencoder else "usf"
     return {**new, "algorithm": new.get("algorithm", {"name": name})}

@@ -1,0 +1,222 @@
+"""From the command line to settings: what is checked, what is said of mistakes, what a resumed run takes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from omegaconf import OmegaConf
+
+from vusfa.cli.launch import compose, launch
+from vusfa.errors import ConfigError
+from vusfa.training import save_checkpoint
+
+
+@pytest.fixture
+def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
+    """Runs a job from a command line, in an empty folder; gives exit code and standard error."""
+    (tmp_path / "work").mkdir()
+    monkeypatch.chdir(tmp_path / "work")
+
+    def launched(*arguments: str, job=None) -> tuple[int, str]:
+        monkeypatch.setattr("sys.argv", ["recipe.py", *arguments])
+        with pytest.raises(SystemExit) as end:
+            launch(job or (lambda settings, overrides: 0))
+        assert list(Path.cwd().iterdir()) == []
+        return end.value.code, capsys.readouterr().err
+
+    return launched
+
+
+@pytest.fixture
+def settings_of(run):
+    """Settings that a job gets from a command line."""
+
+    def settings(*arguments: str) -> dict[str, Any]:
+        seen: dict[str, Any] = {}
+        assert run(*arguments, job=lambda given, overrides: seen.update(given) or 0) == (0, "")
+        return seen
+
+    return settings
+
+
+def test_the_job_gets_settings_and_the_command_line(run):
+    seen = {}
+
+    def job(settings, overrides):
+        seen.update(settings, overrides=overrides)
+        return 7
+
+    assert run("optim=rmsprop", "seed=3", "total_frames=5", "optim.horizon=${total_frames}", job=job) == (
+        7,
+        "",
+    )
+    assert seen["optim"]["kind"] == "rmsprop"
+    assert (seen["seed"], seen["optim"]["horizon"]) == (3, 5)
+    assert seen["overrides"][:2] == ["optim=rmsprop", "seed=3"]
+    assert type(seen["optim"]) is dict
+
+
+@pytest.mark.parametrize(
+    ("argument", "message"),
+    [
+        ("sed=3", "no setting is called 'sed'; did you mean 'seed'?"),
+        ("optim.lrr=3", "no setting is called 'optim.lrr'; did you mean 'optim.lr'?"),
+        ("optin=sgd", "no setting is called 'optin'; did you mean 'optim'?"),
+        ("optim=adamm", "optim=adamm: there is no such choice; did you mean 'adam'?"),
+        ("optim=xyz", "optim=xyz: there is no such choice; there are adam, adam_large_batch, rmsprop"),
+        ("seed", "cannot read 'seed'"),
+        ("seed=[1", "cannot read 'seed=[1'"),
+        ("seed=abc", "seed is 'abc'; it must be a whole number, such as 0"),
+        ("seed=1.5", "seed is 1.5; it must be a whole number, such as 0"),
+        ("seed=null", "seed is null; it must be a whole number, such as 0"),
+        ("optim.lr=fast", "optim.lr is 'fast'; it must be a number, such as 0.001"),
+        ("optim.lr=true", "optim.lr is True; it must be a number, such as 0.001"),
+        ("objective.normalize_advantage=1", "objective.normalize_advantage is 1; it must be true or false"),
+        ("+sede=3", "no setting is called 'sede'; did you mean 'seed'?"),
+        ("++optim.lrr=3", "no setting is called 'optim.lrr'; did you mean 'optim.lr'?"),
+        ("~optim.lr", "optim.lr is missing; it may be 0.001"),
+        ("optim=null", "a group of settings cannot be null"),
+        ("entropy=null", "entropy is null; it is a group of settings: give entropy.start=..."),
+        ("optim.horizon=${sed}", "Interpolation key 'sed' not found"),
+        ("folder=${oc.env:NOBODY}", "KeyError raised while resolving interpolation"),
+    ],
+)
+def test_a_mistake_is_one_line(run, argument: str, message: str):
+    code, text = run(argument)
+    assert code == 2
+    assert text.startswith(f"error: {message}")
+    assert text.count("\n") == 1
+
+
+def test_our_errors_are_one_line_and_bugs_are_not(run, capsys: pytest.CaptureFixture[str]):
+    def refuse(settings, overrides):
+        raise ConfigError("the agent has two heads; give it one")
+
+    assert run(job=refuse) == (2, "error: the agent has two heads; give it one\n")
+
+    def bug(settings, overrides):
+        raise ZeroDivisionError("a bug")
+
+    with pytest.raises(ZeroDivisionError):
+        run(job=bug)
+    capsys.readouterr()
+
+    def interrupted(settings, overrides):
+        raise KeyboardInterrupt
+
+    code, text = run(job=interrupted)
+    assert code == 130
+    assert text.startswith("error: interrupted")
+
+
+def test_every_run_of_a_sweep_has_its_folder(run):
+    folders = []
+
+    def job(settings, overrides):
+        folders.append(Path(settings["folder"]).name)
+        return len(folders)
+
+    sweep = "hydra.sweep.dir=../sweep"
+    assert run("--multirun", sweep, "seed=1,2", job=job)[0] == 2
+    assert run("--multirun", sweep, "seed=1,2", "folder=mine", job=job)[0] == 4
+    assert folders == ["0", "1", "mine", "mine"]
+
+
+def test_compose_is_what_the_command_line_would_be():
+    assert compose(overrides=["optim=rmsprop", "optim.lr=4"]).optim.lr == 4.0
+
+
+@pytest.fixture
+def checkpoint(tmp_path: Path, settings_of):
+    """A checkpoint with the settings of a command line, and what is put over them."""
+
+    def make(*arguments: str, **more: Any) -> Path:
+        config = settings_of(*arguments)
+        for name, value in more.pop("config", {}).items():
+            OmegaConf.update(config := OmegaConf.create(config), name, value)
+            config = OmegaConf.to_container(config)
+        state = {"agent_config": {}, "agent": {}, "goals": torch.tensor([1]), "frames": 5}
+        state |= {"scenes": {"sources": ["kitchen"]}, "config": config, "overrides": list(arguments)}
+        return save_checkpoint(tmp_path / "my run" / "checkpoint.pt", {**state, **more})
+
+    return make
+
+
+def test_a_resumed_run_keeps_its_settings(checkpoint, settings_of):
+    path = checkpoint("optim=rmsprop", "seed=3", "folder=elsewhere", "preset=controlled")
+    settings = settings_of(f"resume={path}", "entropy.start=0.5")
+    assert (settings["optim"]["kind"], settings["seed"], settings["entropy"]["start"]) == ("rmsprop", 3, 0.5)
+    assert (settings["folder"], settings["resume"]) == (str(path.parent), str(path))
+    assert settings["scenes"] == ["kitchen"]
+    settings = settings_of(f"resume={path}", "folder=there", "optim=adam", "scenes=[bathroom]", "seed=4")
+    assert (settings["folder"], settings["optim"]["kind"], settings["seed"]) == ("there", "adam", 4)
+    assert settings["scenes"] == ["bathroom"]
+    assert settings["agent"] == settings_of("preset=controlled")["agent"]
+
+
+def test_schedules_end_with_the_resumed_run(checkpoint, settings_of):
+    path = checkpoint("total_frames=700", "entropy.horizon=600")
+    settings = settings_of(f"resume={path}", "total_frames=900")
+    assert (settings["optim"]["horizon"], settings["entropy"]["horizon"]) == (900, 600)
+    assert settings_of(f"resume={path}", "optim=adam")["optim"]["horizon"] == 700
+    settings = settings_of(f"resume={path}", "total_frames=900", "optim.horizon=700")
+    assert settings["optim"]["horizon"] == 700
+
+
+@pytest.mark.parametrize(
+    ("more", "words"),
+    [
+        ({"config": {"optim.lr": "fast"}}, "optim.lr is 'fast'; it must be a number"),
+        ({"config": {"hydra": {"x": 1}}}, "no setting is called 'hydra.x'"),
+        (
+            {"config": {"optim.options": {"_target_": "os.system"}}},
+            "is called 'optim.options._target_'",
+        ),
+        ({"config": {"folder": "${oc.env:HOME}"}}, "folder is '${oc.env:HOME}'; it must not refer"),
+        ({"config": {"algorithm": {"name": "mine"}}}, "no such algorithm is registered"),
+        ({"config": {"log_every": 0}}, "log_every is 0; it must be more than 0"),
+    ],
+    ids=["type", "hydra", "target", "interpolation", "algorithm", "range"],
+)
+def test_settings_of_a_checkpoint_are_checked(run, checkpoint, more: dict[str, Any], words: str):
+    config = more["config"]
+    if "folder" in config:  # update() would look it up
+        plain = checkpoint()
+        state = torch.load(plain, weights_only=True)
+        state["config"] |= config
+        path = save_checkpoint(plain, state)
+    else:
+        path = checkpoint(**more)
+    code, text = run(f"resume={path}")
+    assert code == 2
+    assert text.startswith(f"error: {path}: ")
+    assert words in text
+    assert text.count("\n") == 1
+
+
+def test_the_recorded_command_line_of_a_checkpoint_is_never_run(run, checkpoint, tmp_path: Path):
+    trap = tmp_path / "sprung"
+    target = f"{{_target_: pathlib.Path.touch, self: {trap}}}"
+    code, text = run(f"resume={checkpoint(overrides=[f'+hydra.callbacks.x={target}'])}")
+    assert (code, text.count("\n"), trap.exists()) == (2, 1, False)
+    assert "checkpoint.pt: its command line holds '+hydra.callbacks.x=" in text
+    seen: dict[str, Any] = {}
+    path = checkpoint(overrides=["--config-dir=/tmp", "seed=77"])
+    assert run(f"resume={path}", job=lambda settings, overrides: seen.update(settings) or 0) == (0, "")
+    assert seen["seed"] == 0
+
+
+@pytest.mark.parametrize("argument", ["preset=paper", "~optim.lr"])
+def test_what_cannot_be_given_beside_resume(run, checkpoint, argument: str):
+    code, text = run(f"resume={checkpoint()}", argument)
+    assert (code, text.count("\n")) == (2, 1)
+
+
+def test_settings_without_a_checkpoint_file(run):
+    assert run("resume=none.pt") == (
+        2,
+        "error: none.pt: no such checkpoint; vusfa train writes RUN/checkpoint.pt\n",
+    )

@@ -1,0 +1,74 @@
+"""Examples of an algorithm and of a loss term: trained as a script, resumed, evaluated like any other."""
+
+from __future__ import annotations
+
+import csv
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+
+from vusfa.training import load_agent, load_checkpoint
+
+EXAMPLES = Path(__file__).parents[2] / "examples" / "extending"
+
+
+def start(example: str, *overrides: str, folder: Path) -> str:
+    command = [sys.executable, str(EXAMPLES / f"{example}.py"), *overrides, f"folder={folder}"]
+    done = subprocess.run(command, cwd=folder.parent, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    return done.stderr
+
+
+@pytest.mark.parametrize(
+    ("example", "chosen", "column"),
+    [
+        ("algorithm", ["algorithm=ppo", "algorithm.epochs=3", "algorithm.clip=0.1"], "loss_objective"),
+        ("loss_term", ["objective.terms.successor_size=0.01"], "loss_successor_size"),
+    ],
+)
+def test_trained_resumed_and_evaluated(
+    scene_file: Path, tmp_path: Path, example: str, chosen: list[str], column: str
+):
+    settings = [
+        *chosen,
+        f"scenes=[{scene_file}]",
+        "env.goals=[3,9,12]",
+        "agent.hidden_size=8",
+        "agent.embedding_size=8",
+        "collector.num_envs=6",
+        "collector.rollout=4",
+        "optim.horizon=null",
+        "entropy.horizon=null",
+        "log_every=24",
+        "evaluation.episodes_per_goal=1",
+        "evaluation.max_steps=5",
+    ]
+    start(example, *settings, "total_frames=96", folder=tmp_path / "whole")
+    start(example, *settings, "total_frames=48", folder=tmp_path / "parts")
+    path = tmp_path / "parts" / "checkpoint.pt"
+    start(example, f"resume={path}", "total_frames=96", folder=tmp_path / "parts")
+    whole, parts = load_checkpoint(tmp_path / "whole" / "checkpoint.pt"), load_checkpoint(path)
+    assert (whole["frames"], parts["frames"]) == (96, 96)
+    for name, value in whole["agent"].items():
+        assert torch.equal(value, parts["agent"][name]), name
+    steps = max(int(state["step"]) for state in whole["optimizer"]["state"].values())
+    assert steps == (12 if example == "algorithm" else 4)
+    with open(tmp_path / "parts" / "metrics.csv", newline="") as file:
+        assert all(float(row[column]) != 0 for row in csv.DictReader(file))
+    assert (tmp_path / "parts" / "evaluation.csv").is_file()
+    load_agent(path)
+
+
+def test_what_a_script_does_not_register_is_refused(scene_file: Path, tmp_path: Path):
+    """A checkpoint names an algorithm; nothing is imported for it."""
+    sizes = ["agent.hidden_size=8", "agent.embedding_size=8", "collector.num_envs=5", "collector.rollout=4"]
+    more = ["algorithm=ppo", f"scenes=[{scene_file}]", "total_frames=20", "evaluation=none"]
+    start("algorithm", *sizes, *more, "env.goals=[3,9,12]", folder=tmp_path / "run")
+    command = [sys.executable, str(EXAMPLES / "loss_term.py"), f"resume={tmp_path / 'run' / 'checkpoint.pt'}"]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
+    assert done.returncode == 2
+    assert "algorithm.name is 'ppo': no such algorithm is registered" in done.stderr
+    assert done.stderr.count("\n") == 1

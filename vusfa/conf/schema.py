@@ -1,0 +1,203 @@
+"""Checks of settings with OmegaConf and Hydra's ConfigStore; what is wrong is said in one line.
+
+Needs Hydra (extra ``recipes``).
+"""
+
+from __future__ import annotations
+
+import difflib
+import types
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import fields, is_dataclass
+from typing import Any, Union, get_args, get_origin, get_type_hints
+
+from hydra.core.config_store import ConfigStore
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import ConfigKeyError, OmegaConfBaseException, ValidationError
+
+from vusfa.conf.compose import default_settings
+from vusfa.conf.settings import ALGORITHMS, LOSS_TERMS, POSITIVE, ObjectiveSettings, Settings, flat
+from vusfa.errors import ConfigError
+
+__all__ = ["check_overrides", "mistake", "near", "register_schema", "schema", "validated"]
+
+_WORDS = {bool: "true or false", int: "a whole number", float: "a number", str: "text"}
+_EXAMPLES = {"scenes": "[bathroom, kitchen]"}
+
+
+def schema() -> DictConfig:
+    """Types of all settings, with those of the registered algorithms' terms."""
+    types_ = OmegaConf.structured(Settings)
+    types_.objective = OmegaConf.structured(ObjectiveSettings)
+    types_.objective.terms = dict(LOSS_TERMS)
+    return types_
+
+
+def register_schema() -> None:
+    """Gives Hydra's ConfigStore the types, as ``settings``, and the group ``algorithm``."""
+    store = ConfigStore.instance()
+    store.store(name="settings", node=schema())
+    for name, settings in ALGORITHMS.items():
+        store.store(group="algorithm", name=name, node=settings)
+
+
+def check_overrides(overrides: Sequence[str]) -> None:
+    """Refuses another word than true or false for a setting that is one of these two: OmegaConf would take
+    ``off``, ``no`` and ``0`` as well.
+
+    Args:
+        overrides: of the command line, ``setting=value``.
+
+    Raises:
+        ConfigError: naming setting and value.
+
+    >>> check_overrides(["agent.shared_heads=true"])
+    >>> check_overrides(["agent.shared_heads=off"])
+    Traceback (most recent call last):
+    ...
+    vusfa.errors.ConfigError: agent.shared_heads is 'off'; it must be true or false or null
+    """
+    for override in OverridesParser.create().parse_overrides(list(overrides)):
+        kind, optional = _type_of(override.key_or_group)
+        if kind is not bool or override.is_sweep_override() or override.is_delete():
+            continue
+        value = override.value()
+        if not isinstance(value, bool) and not (optional and value is None) and "${" not in str(value):
+            raise ConfigError(_wrong_value(override.key_or_group, value))
+
+
+def validated(settings: Mapping[str, Any], where: str = "") -> dict[str, Any]:
+    """Plain settings, after a check of names, types and ranges.
+
+    Args:
+        settings: plain or OmegaConf's, all of them.
+        where: begins the message; a file.
+
+    Raises:
+        ConfigError: a setting that is unknown, missing, of another type or out of range.
+    """
+    plain: Any = OmegaConf.to_container(settings) if isinstance(settings, DictConfig) else dict(settings)
+    try:
+        _check_data(plain)
+        groups = {field.name for field in fields(Settings)}
+        for setting in flat(plain):
+            if setting.partition(".")[0] not in groups:
+                raise ConfigError(f"no setting is called {setting!r}{near(setting, _names())}")
+        known = schema()
+        name = plain.get("algorithm", {}).get("name") if isinstance(plain.get("algorithm"), dict) else None
+        if name not in ALGORITHMS:
+            raise ConfigError(
+                f"algorithm.name is {name!r}: no such algorithm is registered{near(str(name), ALGORITHMS)}"
+            )
+        known.algorithm = OmegaConf.structured(ALGORITHMS[name])
+        merged = OmegaConf.merge(known, plain)
+        missing = OmegaConf.missing_keys(merged)
+        if missing:
+            raise ConfigError(f"{min(missing)} is missing; it may be {_example(min(missing))}")
+        result: Any = OmegaConf.to_container(merged)
+        _check_ranges(result)
+        return result
+    except OmegaConfBaseException as error:
+        raise ConfigError(f"{where}{mistake(error)}") from error
+    except ConfigError as error:
+        raise ConfigError(f"{where}{error}") from error
+
+
+def mistake(error: BaseException) -> str | None:
+    """One line for an error of OmegaConf's about a setting, or about one that Hydra found while composing."""
+    while error is not None:
+        key = getattr(error, "full_key", None)
+        if isinstance(error, ConfigKeyError) or type(error).__name__ == "ConfigAttributeError":
+            return f"no setting is called {key!r}{near(str(key), _names())}"
+        if isinstance(error, ValidationError) and key:
+            return _wrong_value(key, error.value)
+        if type(error).__name__ == "ConfigTypeError" and "deletion" in str(error):
+            return f"{key} is missing; it may be {_example(str(key))}"
+        if error.__cause__ is None:
+            break
+        error = error.__cause__
+    return None
+
+
+def near(word: str, choices: Iterable[str]) -> str:
+    """The end of a sentence on an unknown word: the choice that comes near, or all of a few.
+
+    >>> near("optm", ["optim", "env"])
+    "; did you mean 'optim'?"
+    """
+    choices = list(choices)
+    found = difflib.get_close_matches(word, choices, n=1, cutoff=0.5)
+    if found:
+        return f"; did you mean {found[0]!r}?"
+    return f"; there are {', '.join(choices)}" if len(choices) <= 12 else "; --help lists all settings"
+
+
+def _check_data(plain: Any, prefix: str = "") -> None:
+    """Nothing that OmegaConf would look up, and no name that a library would act on."""
+    if isinstance(plain, dict):
+        for key, value in plain.items():
+            if not isinstance(key, str) or key.startswith("_"):
+                raise ConfigError(f"no setting is called {prefix + str(key)!r}")
+            _check_data(value, f"{prefix}{key}.")
+    elif isinstance(plain, list):
+        for value in plain:
+            _check_data(value, prefix)
+    elif isinstance(plain, str) and "${" in plain:
+        raise ConfigError(f"{prefix.rstrip('.')} is {plain!r}; it must not refer to other settings")
+    elif plain is not None and not isinstance(plain, (bool, int, float, str)):
+        raise ConfigError(f"{prefix.rstrip('.')} is a {type(plain).__name__}; it must be plain data")
+
+
+def _check_ranges(settings: Mapping[str, Any]) -> None:
+    scenes = [settings["scenes"]] if isinstance(settings["scenes"], str) else settings["scenes"]
+    if not isinstance(scenes, list):
+        raise ConfigError(f"scenes is {_shown(scenes)}; it must be a list, such as {_example('scenes')}")
+    if not all(isinstance(scene, str) for scene in scenes):
+        raise ConfigError(f"scenes is {_shown(scenes)}; each entry must be as in {_example('scenes')}")
+    for name in POSITIVE:
+        value: Any = settings
+        for part in name.split("."):
+            value = value[part]
+        if value is not None and value <= 0:
+            raise ConfigError(f"{name} is {value}; it must be more than 0")
+
+
+def _type_of(name: str) -> tuple[Any, bool]:
+    """Type of a setting by its dotted name, and whether it may be null; Any where nothing is known."""
+    kind, optional = Settings, False
+    for part in name.split("."):
+        hints = get_type_hints(kind) if is_dataclass(kind) else {}
+        if part not in hints:
+            return Any, True
+        kind, optional = hints[part], False
+        if get_origin(kind) in (Union, types.UnionType):
+            optional = type(None) in get_args(kind)
+            (kind,) = (argument for argument in get_args(kind) if argument is not type(None))
+    return kind, optional
+
+
+def _wrong_value(name: str, value: Any) -> str:
+    kind, optional = _type_of(name)
+    if is_dataclass(kind) or get_origin(kind) is dict:
+        inner = [key for key in _names() if key.startswith(f"{name}.")] or [f"{name}.NAME"]
+        return f"{name} is {_shown(value)}; it is a group of settings: give {'=..., '.join(inner)}=..."
+    words = "a list" if get_origin(kind) is list else _WORDS.get(kind, "another value")
+    example = "" if kind is bool else _example(name)
+    words += f", such as {example}" if example not in ("", "null") else ""
+    return f"{name} is {_shown(value)}; it must be {words}{' or null' if optional else ''}"
+
+
+def _names() -> list[str]:
+    return list(default_settings())
+
+
+def _example(name: str) -> str:
+    return _EXAMPLES.get(name) or _shown(default_settings().get(name))
+
+
+def _shown(value: Any) -> str:
+    """As on a command line."""
+    if isinstance(value, list):
+        return f"[{', '.join(map(str, value))}]"
+    return "null" if value is None else repr(value)

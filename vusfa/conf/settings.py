@@ -1,0 +1,209 @@
+"""Settings of a training: one dataclass per group, with the type of every setting.
+
+Their values stand in the YAML files beside this module, once. :mod:`vusfa.conf.schema` checks values against
+these types with OmegaConf. ``None`` stands for ``null``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+__all__ = [
+    "ALGORITHMS",
+    "LOSS_TERMS",
+    "POSITIVE",
+    "AgentSettings",
+    "CollectorSettings",
+    "EntropySettings",
+    "EnvSettings",
+    "EvaluationSettings",
+    "HindsightSettings",
+    "LoggerSettings",
+    "ObjectiveSettings",
+    "OptimSettings",
+    "Settings",
+    "flat",
+]
+
+#: Settings of every registered algorithm, by its name (:func:`vusfa.algorithms.register_algorithm`).
+ALGORITHMS: dict[str, Any] = {}
+#: Registered additional loss terms (:func:`vusfa.algorithms.register_loss_term`), with a coefficient of 0.
+LOSS_TERMS: dict[str, float] = {}
+#: Settings that a run divides by.
+POSITIVE = ("log_every", "checkpoint_every", "total_frames", "optim.horizon", "entropy.horizon")
+
+
+@dataclass
+class EnvSettings:
+    """Of :class:`vusfa.envs.TargetNavEnv`; goals and crop may be of several types."""
+
+    goals: Any
+    max_steps: int
+    goal_sampling: str
+    crop: Any
+    goal_reward: float
+    step_reward: float
+    collision_reward: float | None
+
+
+@dataclass
+class AgentSettings:
+    """Of :func:`vusfa.modules.make_agent`; null leaves a field to the architecture."""
+
+    model: str
+    architecture: str
+    history: int | None
+    embedding_size: int | None
+    hidden_size: int | None
+    observation: str | None
+    encoder: str | None
+    picture_size: list[int] | None
+    normalize_features: bool | None
+    normalize_embedding: bool | None
+    shared_encoder: bool | None
+    embedding_layer: bool | None
+    state_layer: bool | None
+    memory: str | None
+    shared_heads: bool | None
+    pretrained: str | None
+    successor_norm: str | None
+    rectify_logits: bool | None
+    scale: str | None
+    initial_scale: float | None
+    eval_latent: str | None
+    successor_scale: float | None
+    reward_scale: float | None
+
+
+@dataclass
+class ObjectiveSettings:
+    """Of USFLoss, USFEstimator and DualAscent of :mod:`vusfa.objectives`, and coefficients of further
+    terms."""
+
+    objective_coeff: float
+    critic_coeff: float
+    successor_coeff: float
+    bottleneck_coeff: float
+    bottleneck_step_size: float
+    information_target: float
+    bottleneck_on: str
+    gamma: float
+    lmbda: float
+    normalize_advantage: bool
+    min_advantage_std: float
+    bootstrap_at_timeout: bool
+    terms: dict[str, float]
+
+
+@dataclass
+class HindsightSettings:
+    """Numbers of ``algorithm=hindsight``."""
+
+    updates: int
+    batch_size: int
+    capacity: int
+    horizon: int
+    own_future: float
+    critic_coeff: float
+    objective_coeff: float
+    expectile: float
+    temperature: float
+    max_weight: float
+
+
+@dataclass
+class OptimSettings:
+    """Of :func:`vusfa.training.make_optimizer`."""
+
+    kind: str
+    lr: float
+    horizon: int | None
+    max_grad_norm: float | None
+    options: dict[str, Any]
+
+
+@dataclass
+class CollectorSettings:
+    """Of :func:`vusfa.training.make_collector`."""
+
+    kind: str
+    num_envs: int
+    rollout: int
+    num_workers: int
+
+
+@dataclass
+class LoggerSettings:
+    """Of :func:`vusfa.training.make_loggers`."""
+
+    kinds: list[str]
+    project: str
+    mode: str
+    name: str | None
+
+
+@dataclass
+class EvaluationSettings:
+    """Of the evaluation at the end; goals may be a word, a list of ids, or null."""
+
+    goals: Any
+    episodes_per_goal: int
+    max_steps: int
+
+
+@dataclass
+class EntropySettings:
+    """Coefficient of the policy's entropy, linear in the frames."""
+
+    start: float
+    end: float
+    horizon: int | None
+
+
+@dataclass
+class Settings:
+    """All settings of a training.
+
+    ``autocast`` is true, false or ``"auto"``; ``scenes`` is a list, or one name. ``algorithm`` has the
+    settings of the one chosen, see :data:`ALGORITHMS`. ``by_model`` holds numbers of presets that depend on
+    the model.
+    """
+
+    env: EnvSettings
+    agent: AgentSettings
+    algorithm: Any
+    objective: ObjectiveSettings
+    hindsight: HindsightSettings
+    optim: OptimSettings
+    collector: CollectorSettings
+    logger: LoggerSettings
+    evaluation: EvaluationSettings
+    entropy: EntropySettings
+    scenes: Any
+    seed: int
+    folder: str
+    total_frames: int
+    device: str
+    threads: int
+    autocast: Any
+    log_every: int
+    checkpoint_every: int
+    resume: str | None
+    by_model: dict[str, Any] = field(default_factory=dict)
+
+
+def flat(settings: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Nested settings as one level with dotted names.
+
+    >>> flat({"optim": {"lr": 0.1}, "seed": 1})
+    {'optim.lr': 0.1, 'seed': 1}
+    """
+    result: dict[str, Any] = {}
+    for key, value in settings.items():
+        if isinstance(value, Mapping):
+            result |= flat(value, f"{prefix}{key}.")
+        else:
+            result[f"{prefix}{key}"] = value
+    return result
