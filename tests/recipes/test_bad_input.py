@@ -144,8 +144,8 @@ def test_an_unknown_scene(run):
         ("logger.kinds=null", "logger.kinds is null; it must be a list, such as [csv]"),
         ("logger.kinds=csv", "logger.kinds is 'csv'; it must be a list, such as [csv]"),
         ("optim.options=null", "optim.options is null; it is a group of settings: give optim.options.eps="),
-        ("agent.model=null", "model is 'null'; it must be one of"),
-        ("agent.model=null preset=paper", "model is 'null'; it must be one of"),
+        ("agent.model=null", "agent.model is null; it must be text, such as 'vusfa'"),
+        ("agent.model=null preset=paper", "agent.model is null; it must be text, such as 'vusfa'"),
     ],
 )
 def test_an_unknown_key_or_value(run, argument: str, words: str):
