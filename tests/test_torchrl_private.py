@@ -9,12 +9,15 @@ from pathlib import Path
 import pytest
 import torch
 from tensordict import TensorDict
+from torchrl.collectors import BaseCollector, Collector
 from torchrl.envs import EnvBase
+from torchrl.envs.utils import RandomPolicy
+from torchrl.weight_update import WeightSyncScheme
 
 import vusfa
 from vusfa.envs import TargetNavEnv
 from vusfa.scenes import SceneSet
-from vusfa.torchrl_private import StatelessEnv, unchecked_tensordict
+from vusfa.torchrl_private import StatelessEnv, carrier, put_carrier, unchecked_tensordict
 
 PACKAGE = Path(vusfa.__file__).parent
 
@@ -52,6 +55,30 @@ def test_torchrl_calls_the_hook() -> None:
     assert "_step_and_maybe_reset(tensordict)" in source
 
 
+def test_a_collector_steps_on_from_its_carrier() -> None:
+    """Put back, it gives the same steps; without it a collector begins new episodes."""
+    env = TargetNavEnv(SceneSet.bundled(["bathroom"]), "all", [4], max_steps=50, seed=0)
+    collector = Collector(
+        env, RandomPolicy(env.action_spec), frames_per_batch=12, total_frames=-1, track_traj_ids=False
+    )
+    batches = iter(collector)
+    next(batches)
+    stands = carrier(collector)
+    torch.manual_seed(1)
+    first = next(batches).clone()
+    assert (first["state_id"][:, 0] == stands["state_id"]).all()
+    put_carrier(collector, stands.to_dict())
+    torch.manual_seed(1)
+    again = next(batches)
+    assert (first["next", "state_id"] == again["next", "state_id"]).all()
+    collector.shutdown()
+
+
+def test_weights_are_shared_by_schemes_that_end() -> None:
+    assert "_weight_sync_schemes" in inspect.getsource(BaseCollector)
+    assert callable(WeightSyncScheme.shutdown)
+
+
 def test_torchrl_asks_whether_a_reset_resumes_episodes() -> None:
     assert EnvBase._supports_set_state is False
     assert StatelessEnv._supports_set_state is True
@@ -61,10 +88,11 @@ def test_torchrl_asks_whether_a_reset_resumes_episodes() -> None:
     assert resumed["step_count"].item() == 9
 
 
-@pytest.mark.parametrize("room", ["envs", "scenes", "sources"])
+@pytest.mark.parametrize("room", ["algorithms", "conf", "envs", "scenes", "sources", "training"])
 def test_no_other_file_names_them(room: str) -> None:
     private = re.compile(
         r"_new_unsafe|_set_str|\b_step_mdp|_step_and_maybe_reset|_supports_set_state|__dict__\["
+        r"|\._carrier|_weight_sync_schemes"
     )
     files = sorted((PACKAGE / room).rglob("*.py"))
     assert files

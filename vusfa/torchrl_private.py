@@ -8,20 +8,53 @@
     the public way is not to define it: EnvBase then steps, and resets with a mask.
 ``EnvBase._supports_set_state``
     declares that ``reset(tensordict, set_state=True)`` resumes episodes; there is no public way.
+``Collector._carrier``
+    is what a collector steps on from: a resumed training goes on in mid-episode, number for number; the
+    public way is ``Collector.reset``, which begins new episodes.
+``BaseCollector._weight_sync_schemes``
+    are the threads that share weights with workers. Left to the garbage collector, they end when the
+    interpreter does, which then waits forever; the public way, ``BaseCollector.shutdown``, leaves them
+    running.
 
 ``tests/test_torchrl_private.py`` fails when a new TorchRL changes one of them.
 """
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.envs import EnvBase
 
-__all__ = ["StatelessEnv", "unchecked_tensordict"]
+if TYPE_CHECKING:
+    from torchrl.collectors import BaseCollector, Collector
+
+__all__ = [
+    "StatelessEnv",
+    "carrier",
+    "end_weight_sharing",
+    "put_carrier",
+    "unchecked_tensordict",
+]
+
+
+def carrier(collector: Collector) -> TensorDict:
+    """A copy of what a collector steps on from."""
+    return collector._carrier.clone()
+
+
+def put_carrier(collector: Collector, content: dict[str, Any]) -> None:
+    """Has a collector step on from what :func:`carrier` gave, as nested dictionaries of tensors."""
+    before = collector._carrier
+    collector._carrier = TensorDict(content, batch_size=before.batch_size, device=before.device)
+
+
+def end_weight_sharing(collector: BaseCollector) -> None:
+    """Ends the threads that share weights with a collector's workers."""
+    for scheme in (collector._weight_sync_schemes or {}).values():
+        scheme.shutdown()
 
 
 def unchecked_tensordict(

@@ -3,17 +3,25 @@
 from __future__ import annotations
 
 import random
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from tensordict import TensorDict
 
+from vusfa.cli.launch import launch
 from vusfa.errors import CheckpointError
+from vusfa.experiments.training import train
 from vusfa.scenes import Scene, SceneSet
+from vusfa.training import load_agent
 from vusfa.training.checkpoint import check_scenes, load_checkpoint, save_checkpoint
 from vusfa.training.random_state import random_state, restore_random_state
+from vusfa.training.upgrade import upgrade_config
+
+DATA = Path(__file__).parent / "data"
 
 STATE = {
     "agent_config": {},
@@ -96,3 +104,40 @@ def test_random_states_come_back(tmp_path: Path):
     restore_random_state(load_checkpoint(path)["rng"])
     again = torch.rand(3).tolist(), np.random.rand(3).tolist(), [random.gauss(0, 1) for _ in range(3)]  # noqa: NPY002
     assert drawn == again
+
+
+def answers(agent) -> dict[str, torch.Tensor]:
+    rows = {"state_id": torch.arange(20).unsqueeze(-1), "goal_id": torch.full((20,), 9)}
+    inputs = TensorDict({**rows, "scene_id": torch.zeros(20, dtype=torch.int64)}, [20])
+    with torch.no_grad():
+        logits = agent.get_policy_operator().get_dist(inputs.clone()).logits
+        return {"logits": logits, "state_value": agent.get_value_operator()(inputs)["state_value"]}
+
+
+def test_a_checkpoint_of_version_0_1_loads():
+    agent, scenes, state = load_agent(DATA / "checkpoint_0_1.pt")
+    assert (scenes.names, state["frames"], state["format"]) == (("bathroom",), 48, 2)
+    assert agent.config["model"] == "vusfa"
+    expected, found = torch.load(DATA / "expected_0_1.pt"), answers(agent)
+    for name, value in found.items():
+        torch.testing.assert_close(value, expected[name])
+
+
+def test_a_training_of_version_0_1_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """As it would have there: weights, optimizer, replay, random states, environments in mid-episode."""
+    shutil.copy(DATA / "checkpoint_0_1.pt", tmp_path / "checkpoint.pt")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("sys.argv", ["train", "resume=checkpoint.pt"])
+    trained = []
+    with pytest.raises(SystemExit) as end:
+        launch(lambda settings, overrides: trained.append(train(settings, overrides)) or 0)
+    assert end.value.code == 0
+    trainer = trained[0].trainer
+    assert (trainer.frames, trainer.settings["algorithm"]) == (96, {"name": "hindsight"})
+    expected = torch.load(DATA / "expected_0_1.pt")["resumed_logits"]
+    torch.testing.assert_close(answers(trainer.agent.eval())["logits"], expected)
+
+
+def test_settings_that_only_version_0_1_has_are_named():
+    with pytest.raises(CheckpointError, match=r"objective.n_steps=5, which only version 0.1 has"):
+        upgrade_config({"objective": {"n_steps": 5}})

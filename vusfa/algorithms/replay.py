@@ -212,7 +212,7 @@ class HindsightReplay:
         rows = self.buffer[:].to_dict() if len(self) else {}
         return {
             "rows": rows,
-            "cursor": self.buffer.writer.state_dict()["_cursor"],
+            "writer": self.buffer.writer.state_dict(),
             "clock": self._clock,
             "sampler": self.sampler.state_dict(),
         }
@@ -233,6 +233,6 @@ class HindsightReplay:
             )
         if length:
             self.buffer.extend(TensorDict(state["rows"], [length]))
-            self.buffer.writer.load_state_dict({"_cursor": state["cursor"]})
+            self.buffer.writer.load_state_dict(state["writer"])
         self._clock = state["clock"]
         self.sampler.load_state_dict(state["sampler"])

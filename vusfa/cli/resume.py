@@ -34,7 +34,7 @@ def resumed_settings(given: Mapping[str, Any], overrides: Sequence[str]) -> dict
     path = Path(given["resume"])
     state = load_checkpoint(path)
     try:
-        stored = validated(state["config"], where=f"{path}: ")
+        stored = validated(_completed(state["config"], given), where=f"{path}: ")
     except (ConfigError, KeyError, TypeError, AttributeError) as error:
         text = str(error) if isinstance(error, ConfigError) else f"{path}: it holds no settings"
         raise CheckpointError(text) from error
@@ -58,6 +58,15 @@ def resumed_settings(given: Mapping[str, Any], overrides: Sequence[str]) -> dict
         if origin[group]["horizon"] == origin["total_frames"] and f"{group}.horizon" not in names:
             settings[group]["horizon"] = settings["total_frames"]
     return settings
+
+
+def _completed(stored: Mapping[str, Any], defaults: Mapping[str, Any]) -> dict[str, Any]:
+    """Stored settings, with the defaults of groups and settings that an earlier version did not have."""
+    completed = {**defaults, **stored}
+    for name, group in stored.items():
+        if isinstance(group, Mapping) and isinstance(defaults.get(name), Mapping) and name != "algorithm":
+            completed[name] = {**defaults[name], **group}
+    return completed
 
 
 def _copy(source: Mapping[str, Any], target: dict[str, Any], parts: Sequence[str]) -> None:

@@ -18,7 +18,6 @@ from functools import partial
 from typing import Any
 
 import torch
-from tensordict import TensorDict
 from tensordict.nn import TensorDictModuleBase
 from torchrl.collectors import BaseCollector, Collector, MultiAsyncCollector, MultiSyncCollector
 from torchrl.envs import EnvBase, TransformedEnv
@@ -27,6 +26,7 @@ from torchrl.envs.transforms import Compose, Transform
 from vusfa.envs import TargetNavEnv
 from vusfa.errors import CheckpointError, ConfigError
 from vusfa.scenes import SceneSet
+from vusfa.torchrl_private import carrier, end_weight_sharing, put_carrier
 from vusfa.training.signals import ignore_interrupts
 
 __all__ = [
@@ -196,10 +196,7 @@ def opened(make: Callable[[], BaseCollector]) -> Iterator[BaseCollector]:
 def close_collector(collector: BaseCollector) -> None:
     """End a collector's processes."""
     collector.shutdown()
-    # Left to the garbage collector, the sharing of weights ends when the interpreter does, where it starts a
-    # thread and waits for it forever. An exception's traceback is enough to keep it alive that long.
-    for scheme in (collector._weight_sync_schemes or {}).values():
-        scheme.shutdown()
+    end_weight_sharing(collector)  # an exception's traceback is enough to keep it alive
 
 
 def collector_state(collector: BaseCollector) -> dict[str, Any]:
@@ -210,11 +207,12 @@ def collector_state(collector: BaseCollector) -> dict[str, Any]:
     """
     if not isinstance(collector, Collector):
         return {}
+    stands = carrier(collector)
     return {
         "env": dict(collector.env.state_dict()),
         "generator": _base(collector.env).get_rng_state(),
-        "batch_size": list(collector._carrier.batch_size),
-        "carrier": collector._carrier.clone().to_dict(),
+        "batch_size": list(stands.batch_size),
+        "carrier": stands.to_dict(),
     }
 
 
@@ -227,7 +225,7 @@ def load_collector_state(collector: BaseCollector, state: dict[str, Any]) -> Non
     """
     if not isinstance(collector, Collector) or not state:
         return
-    batch_size = list(collector._carrier.batch_size)
+    batch_size = list(carrier(collector).batch_size)
     if state["batch_size"] != batch_size:
         raise CheckpointError(
             f"the checkpoint holds {state['batch_size']} environments, the collector {batch_size};"
@@ -235,8 +233,7 @@ def load_collector_state(collector: BaseCollector, state: dict[str, Any]) -> Non
         )
     collector.env.load_state_dict(state["env"])
     _base(collector.env).set_rng_state(state["generator"])
-    # The collector has no public way to be put in mid-episode. What it goes on from is its carrier.
-    collector._carrier = TensorDict(state["carrier"], batch_size=batch_size, device=collector._carrier.device)
+    put_carrier(collector, state["carrier"])
 
 
 def _base(env: EnvBase) -> TargetNavEnv:

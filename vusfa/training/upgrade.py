@@ -23,20 +23,6 @@ _DROPPED: dict[str, dict[str, Any]] = {
     },
 }
 
-# version 0.1 had no numbers of hindsight in the settings of a training without it
-_HINDSIGHT = {
-    "updates": 10,
-    "batch_size": 8192,
-    "capacity": 1_000_000,
-    "horizon": 30,
-    "own_future": 0.5,
-    "critic_coeff": 100.0,
-    "objective_coeff": 1.0,
-    "expectile": 0.7,
-    "temperature": 0.02,
-    "max_weight": 10.0,
-}
-
 
 def upgrade(state: Mapping[str, Any]) -> dict[str, Any]:
     """The content of a checkpoint of format 1, in format 2.
@@ -47,7 +33,9 @@ def upgrade(state: Mapping[str, Any]) -> dict[str, Any]:
     new = {key: value for key, value in state.items() if key not in ("loss", "replay", "optimiser")}
     algorithm = {"loss": state.get("loss", {})}
     if state.get("replay"):
-        algorithm["replay"] = state["replay"]
+        replay = dict(state["replay"])
+        replay["writer"] = {"_cursor": replay.pop("cursor")}  # torchrl's own name in its writer's state
+        algorithm["replay"] = replay
     new |= {"format": 2, "algorithm": algorithm, "optimizer": state.get("optimiser", {})}
     new["config"] = upgrade_config(state.get("config", {}))
     return new
@@ -73,8 +61,8 @@ def upgrade_config(config: Mapping[str, Any]) -> dict[str, Any]:
     if "terms" not in new.get("objective", {"terms": {}}):
         new["objective"]["terms"] = {"reward": new["objective"].pop("reward_coeff", 0.0)}
     hindsight = bool(new.get("hindsight", {}).get("updates", 0))
-    if not hindsight and "hindsight" in new and "algorithm" not in new:
-        new["hindsight"] = dict(_HINDSIGHT)
+    if not hindsight and "algorithm" not in new:
+        new.pop("hindsight", None)  # it had no numbers there; those of today are added
     autoencoder = new.get("agent", {}).get("pretrained") == "autoencoder"
     name = "hindsight" if hindsight else "autoencoder" if autoencoder else "usf"
     return {**new, "algorithm": new.get("algorithm", {"name": name})}
