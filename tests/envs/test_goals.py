@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from pathlib import Path
 
@@ -206,3 +207,30 @@ def test_spread_goals_leave_islands_alone() -> None:
     graph = torch.tensor([[1], [2], [0], [4], [3]])  # a ring of three and an island of two
     scene = Scene("ring and island", graph, torch.rand(5, 1, 2))
     assert set(spread_goals(scene, 3)) == {0, 1, 2}
+
+
+def test_a_manifest_of_aliases_is_refused_at_once_and_briefly(scenes: SceneSet, tmp_path: Path) -> None:
+    """A few hundred bytes that are 10^9 entries when they are written out."""
+    lines = ["a: &a [1, 1, 1, 1, 1, 1, 1, 1, 1, 1]"]
+    lines += [
+        f"{n}: &{n} [{', '.join([f'*{before}'] * 10)}]"
+        for before, n in zip("abcdefgh", "bcdefghi", strict=True)
+    ]
+    path = tmp_path / "goals.yaml"
+    path.write_text("\n".join(lines))
+    with pytest.raises(GoalError, match="give a list of state ids") as caught:
+        resolve_goals(scenes, path)
+    assert len(str(caught.value)) < 1000
+
+
+@pytest.mark.parametrize("text", ["[" * 5000, "a: [" + "1, " * 500_000 + "1]"], ids=["deep", "large"])
+def test_a_manifest_beyond_its_limits(scenes: SceneSet, tmp_path: Path, text: str) -> None:
+    (tmp_path / "goals.yaml").write_text(text)
+    with pytest.raises(GoalError, match=r"goals\.yaml: "):
+        resolve_goals(scenes, tmp_path / "goals.yaml")
+
+
+def test_a_manifest_that_is_a_pipe(scenes: SceneSet, tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "goals.yaml")
+    with pytest.raises(GoalError, match="not a regular file"):
+        resolve_goals(scenes, tmp_path / "goals.yaml")

@@ -111,17 +111,17 @@ def _find(sources: list[str] | None, bundled: dict[str, Path]) -> list[Path]:
 
 def _in_folder(folder: Path) -> list[Path]:
     """Files that may be scenes; HDF5 files of other programs, without a graph, are passed over."""
-    import h5py
+    from vusfa.scenes.hdf5 import opened
 
     found = []
     for path in sorted(folder.iterdir()):
         if path.suffix not in _ENDINGS or not path.is_file() or path.name.startswith("."):
             continue
         try:
-            with h5py.File(path, "r") as file:
-                is_scene = "graph" in file
-        except OSError:
-            is_scene = True  # or was: its fault will be said
+            with opened(path) as file:
+                is_scene = file.get("graph", getlink=True) is not None
+        except SceneError:
+            is_scene = True  # or was: its fault is reported later
         if is_scene:
             found.append(path)
     return found

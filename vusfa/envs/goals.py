@@ -29,6 +29,7 @@ from torch import Tensor
 from vusfa.errors import GoalError
 from vusfa.scenes import Scene, SceneSet
 from vusfa.scenes.graph import strong_components
+from vusfa.scenes.limits import MAX_MANIFEST_BYTES, brief
 
 __all__ = ["PAPER_MANIFEST", "GoalSpec", "read_manifest", "resolve_goals", "spread_goals"]
 
@@ -67,7 +68,7 @@ def resolve_goals(scenes: SceneSet, goals: GoalSpec) -> Tensor:
         return _by_scene(scenes, goals, "goals")
     if not isinstance(goals, str | PathLike):
         raise GoalError(
-            f"goals are {goals!r}; give a name, a file, state ids, or a dict of scene names to state ids"
+            f"goals are {brief(goals)}; give a name, a file, state ids, or a dict of scene names to state ids"
         )
     text = fspath(goals)
     if text == "paper":
@@ -79,7 +80,8 @@ def resolve_goals(scenes: SceneSet, goals: GoalSpec) -> Tensor:
     if Path(text).suffix in (".yaml", ".yml"):
         return _by_scene(scenes, read_manifest(text), text)
     raise GoalError(
-        f"goals are {text!r}; give 'paper', 'all', 'random:5' (five a scene), a manifest (.yaml) or state ids"
+        f"goals are {brief(text)}; give 'paper', 'all', 'random:5' (five per scene), a manifest (.yaml) or"
+        f" state ids"
     )
 
 
@@ -92,17 +94,22 @@ def read_manifest(path: str | PathLike[str]) -> dict[str, list[int]]:
     >>> read_manifest(PAPER_MANIFEST)["bathroom_02"]
     [26, 37, 43, 53, 69]
     """
+    path = Path(path)
     try:
-        content = yaml.safe_load(Path(path).read_text(encoding="utf-8"))
+        if not path.is_file() or path.stat().st_size > MAX_MANIFEST_BYTES:
+            raise OSError(f"not a regular file of at most {MAX_MANIFEST_BYTES} bytes")
+        content = yaml.safe_load(path.read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError) as error:
         raise GoalError(f"{path}: cannot be read ({error}); goals come from a YAML manifest") from error
-    except yaml.YAMLError as error:
+    except (yaml.YAMLError, RecursionError) as error:
         raise GoalError(f"{path}: is not YAML ({error}); write lines like 'bathroom: [26, 37]'") from error
     if not isinstance(content, dict) or not content:
         raise GoalError(f"{path}: holds no scenes; write lines like 'bathroom: [26, 37]'")
     for name, ids in content.items():
         if not isinstance(ids, list) or not all(type(i) is int for i in ids):
-            raise GoalError(f"{path}: scene {name!r} has {ids!r}; give a list of state ids, like [26, 37]")
+            raise GoalError(
+                f"{path}: scene {brief(name)} has {brief(ids)}; give a list of state ids, like [26, 37]"
+            )
     return {str(name): ids for name, ids in content.items()}
 
 
@@ -171,8 +178,8 @@ def _as_tensor(goals: Any, source: str) -> Tensor:
         if mixed:
             raise TypeError("a truth value")
         return torch.as_tensor(goals).cpu()
-    except (TypeError, ValueError, RuntimeError) as error:
-        raise GoalError(f"{source}: {goals!r} are no state ids; give integers, like [26, 37]") from error
+    except (TypeError, ValueError, OverflowError, RuntimeError) as error:
+        raise GoalError(f"{source}: {brief(goals)} are no state ids; give integers, like [26, 37]") from error
 
 
 def _by_scene(scenes: SceneSet, goals: Mapping[str, Any], source: str) -> Tensor:
@@ -187,7 +194,7 @@ def _by_scene(scenes: SceneSet, goals: Mapping[str, Any], source: str) -> Tensor
             continue
         if ids.ndim != 1 or ids.is_floating_point() or ids.is_complex() or ids.dtype == torch.bool:
             raise GoalError(
-                f"{source}: scene {scene.name!r} has {given!r}; give a list of state ids, like [26, 37]"
+                f"{source}: scene {scene.name!r} has {brief(given)}; give a list of state ids, like [26, 37]"
             )
         wrong = ids[(ids < 0) | (ids >= scene.num_states)]
         if len(wrong):
@@ -221,7 +228,7 @@ def _random(scenes: SceneSet, text: str) -> Tensor:
     numbers = text.split(":")[1:]
     if not all(number.isdecimal() for number in numbers) or len(numbers) > 2 or int(numbers[0]) < 1:
         raise GoalError(
-            f"goals are {text!r}; write 'random:5' for five a scene, or 'random:5:1' for another draw"
+            f"goals are {brief(text)}; write 'random:5' for five per scene, or 'random:5:1' for another draw"
         )
     count, draw = int(numbers[0]), int(numbers[1]) if len(numbers) == 2 else 0
     found = []
@@ -229,7 +236,7 @@ def _random(scenes: SceneSet, text: str) -> Tensor:
         candidates = _reachable(scene)
         if len(candidates) < count:
             raise GoalError(
-                f"goals are {text!r}, but only {len(candidates)} states of {scene.name!r} can be reached"
+                f"goals are {brief(text)}, but only {len(candidates)} states of {scene.name!r} can be reached"
             )
         # Seeded by the scene's name: neither the order of the scenes nor the environment's seed changes the
         # goals, so that training, evaluation and every worker mean the same ones.

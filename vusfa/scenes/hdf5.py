@@ -12,6 +12,7 @@ import h5py
 import numpy as np
 
 from vusfa.errors import SceneError
+from vusfa.scenes.limits import size_fault
 
 __all__ = ["dataset_in", "opened", "plain", "replaced"]
 
@@ -23,8 +24,10 @@ def opened(path: Path) -> Iterator[h5py.File]:
     Raises:
         SceneError: the file is missing, truncated or damaged, or is no HDF5 file.
     """
-    if not path.is_file():
+    if not path.exists() or path.is_dir():
         raise SceneError(f"{path}: there is no such file; check the path")
+    if not path.is_file():
+        raise SceneError(f"{path}: is no regular file; check the path")
     try:
         with h5py.File(path, "r") as file:
             yield file
@@ -58,9 +61,26 @@ def replaced(path: Path) -> Iterator[h5py.File]:
 
 
 def dataset_in(file: h5py.File, name: str) -> h5py.Dataset | None:
-    """A dataset by name; None when there is none, or a group of that name."""
-    found = file.get(name)
-    return found if isinstance(found, h5py.Dataset) else None
+    """A dataset by name; None when there is none, or a group of that name.
+
+    Raises:
+        OSError: it lies outside the file (a link, external storage, a virtual dataset), or declares more than
+            :mod:`vusfa.scenes.limits` allows. Nothing outside the file is opened.
+    """
+    link = file.get(name, getlink=True)
+    if link is None:
+        return None
+    if not isinstance(link, h5py.HardLink):
+        raise OSError("it is a link to another place; store the data in the file itself")
+    found = file[name]
+    if not isinstance(found, h5py.Dataset):
+        return None
+    if found.external or found.is_virtual:
+        raise OSError("its data lie outside the file; store them in the file itself")
+    fault = size_fault(found)
+    if fault is not None:
+        raise OSError(fault)
+    return found
 
 
 def plain(value: Any) -> Any:

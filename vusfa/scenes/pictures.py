@@ -17,8 +17,18 @@ from PIL import Image, UnidentifiedImageError
 
 from vusfa.errors import SceneError
 from vusfa.scenes.hdf5 import dataset_in, opened
+from vusfa.scenes.limits import MAX_PICTURE_SIDE, PICTURE_FORMATS
 
-__all__ = ["look", "picture_faults", "read_jpegs", "read_pictures", "to_jpeg", "write_jpegs", "write_raw"]
+__all__ = [
+    "decode",
+    "look",
+    "picture_faults",
+    "read_jpegs",
+    "read_pictures",
+    "to_jpeg",
+    "write_jpegs",
+    "write_raw",
+]
 
 _RAW, _JPEG = "observation", "observation_jpeg"
 _AT_ONCE = 32
@@ -33,13 +43,27 @@ def _find(file: h5py.File) -> tuple[str, h5py.Dataset] | None:
     return None
 
 
-def _decode(jpeg: np.ndarray) -> np.ndarray:
+def decode(encoded: bytes) -> np.ndarray:
+    """A JPEG or PNG file as (H, W, 3) uint8.
+
+    Raises:
+        OSError: it is no picture of these formats, damaged, or larger than allowed.
+    """
     try:
-        with Image.open(io.BytesIO(jpeg.tobytes())) as image:
+        with Image.open(io.BytesIO(encoded), formats=PICTURE_FORMATS) as image:
+            if max(image.size) > MAX_PICTURE_SIDE:
+                raise OSError(f"{image.width} x {image.height} pixels; at most {MAX_PICTURE_SIDE} a side")
             return np.asarray(image.convert("RGB"))
     except UnidentifiedImageError as error:
         # Pillow's own words name an address in memory.
         raise OSError("unknown format") from error
+    except (
+        Image.DecompressionBombError,
+        Image.DecompressionBombWarning,
+        ValueError,
+        SyntaxError,
+    ) as error:  # of damaged files, and of huge ones
+        raise OSError(str(error)) from error
 
 
 def to_jpeg(picture: np.ndarray) -> bytes:
@@ -51,27 +75,32 @@ def to_jpeg(picture: np.ndarray) -> bytes:
 
 def look(file: h5py.File, num_states: int | None) -> tuple[tuple[int, int, int] | None, list[str]]:
     """Size of a file's pictures (None without any) and their faults, by the header and the first picture."""
-    found = _find(file)
+    try:
+        found = _find(file)
+    except (OSError, RuntimeError) as error:
+        return None, [f"the pictures cannot be read ({error}); write them again"]
     if found is None:
         return None, []
     name, dataset = found
-    wanted = "uint8 (N, H, W, 3)" if name == _RAW else "(N,) of variable-length uint8"
+    layout = "uint8 (N, H, W, 3)" if name == _RAW else "(N,) of variable-length uint8"
     held = f"dataset {name!r} holds {dataset.dtype} of shape {dataset.shape}"
     if name == _RAW:
         fits = dataset.dtype == np.uint8 and len(dataset.shape or ()) == 4 and dataset.shape[3] == 3
     else:
         fits = h5py.check_vlen_dtype(dataset.dtype) == np.uint8 and len(dataset.shape or ()) == 1
     if not fits or 0 in dataset.shape:
-        return None, [f"{held}; write it as {wanted}, or leave it out"]
+        return None, [f"{held}; write it as {layout}, or leave it out"]
     if num_states is not None and len(dataset) != num_states:
         return None, [
             f"dataset {name!r} has {len(dataset)} pictures, but the graph has {num_states} states;"
             f" write one per state, or leave it out"
         ]
+    if name == _RAW and max(dataset.shape[1:3]) > MAX_PICTURE_SIDE:
+        return None, [f"{held}; make the pictures smaller, at most {MAX_PICTURE_SIDE} pixels a side"]
     if name == _RAW:
         return (dataset.shape[1], dataset.shape[2], 3), []
     try:
-        height, width, _ = _decode(dataset[0]).shape
+        height, width, _ = decode(dataset[0].tobytes()).shape
     except OSError as error:
         return None, [f"dataset {name!r}, state 0: is no picture ({error}); write it again"]
     return (height, width, 3), []
@@ -112,7 +141,7 @@ def _decode_all(path: Path, states: np.ndarray, jpegs: Sequence[np.ndarray]) -> 
     for index, jpeg in enumerate(jpegs):
         state = states[index] if len(states) else 0
         try:
-            pictures.append(_decode(jpeg))
+            pictures.append(decode(jpeg.tobytes()))
         except OSError as error:
             raise SceneError(
                 f"{path}: dataset {_JPEG!r}, state {state}: is no picture ({error}); write it again"

@@ -8,7 +8,6 @@ everything and writes the file.
 from __future__ import annotations
 
 import hashlib
-import io
 import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -16,8 +15,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from PIL import Image
 
+from vusfa.scenes.pictures import decode
 from vusfa.scenes.provenance import Provenance
 from vusfa.scenes.scene import Scene
 from vusfa.scenes.validation import array_faults, raise_faults
@@ -132,9 +131,7 @@ def _reader(pictures: Pictures) -> Callable[[int, int], np.ndarray]:
         return pictures
     if isinstance(pictures, np.ndarray):
         return lambda first, last: pictures[first:last]
-    return lambda first, last: np.stack(
-        [np.asarray(Image.open(io.BytesIO(picture)).convert("RGB")) for picture in pictures[first:last]]
-    )
+    return lambda first, last: np.stack([decode(picture) for picture in pictures[first:last]])
 
 
 def _digest(read: Callable[[int, int], np.ndarray], num_pictures: int, batch: int) -> str:

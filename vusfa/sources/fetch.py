@@ -24,6 +24,7 @@ import yaml
 from vusfa.errors import ConfigError, SceneError
 from vusfa.scenes import store
 from vusfa.scenes.hdf5 import opened
+from vusfa.scenes.limits import MAX_MANIFEST_BYTES, brief
 from vusfa.sources.download import Patience, download
 
 __all__ = ["Archive", "archives", "arrived_faults", "fetch"]
@@ -63,8 +64,10 @@ def archives(config: str | os.PathLike[str] | None = None) -> dict[str, Archive]
     """
     path = _CONFIG if config is None else Path(config)
     try:
+        if not path.is_file() or path.stat().st_size > MAX_MANIFEST_BYTES:
+            raise OSError(f"not a regular file of at most {MAX_MANIFEST_BYTES} bytes")
         entries = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+    except (OSError, UnicodeDecodeError, yaml.YAMLError, RecursionError) as error:
         raise ConfigError(f"{path}: cannot be read as YAML ({error}); correct it") from error
     if not isinstance(entries, dict) or not all(isinstance(entry, dict) for entry in entries.values()):
         raise ConfigError(f"{path}: must map names to archives; see {_CONFIG} for an example")
@@ -80,15 +83,15 @@ def _archive(where: str, name: str, entry: dict[str, Any]) -> Archive:
         raise ConfigError(f"{where}: there is no key {wrong[0]!r}; the keys are {', '.join(sorted(known))}")
     mirrors, scenes = entry.get("mirrors"), entry.get("scenes")
     if not isinstance(mirrors, list) or not all(isinstance(url, str) for url in mirrors) or not mirrors:
-        raise ConfigError(f"{where}: mirrors is {mirrors!r}; list one address or more")
+        raise ConfigError(f"{where}: mirrors is {brief(mirrors)}; list one address or more")
     if not isinstance(scenes, dict) or not all(isinstance(count, int) for count in scenes.values()):
-        raise ConfigError(f"{where}: scenes is {scenes!r}; map each name to its number of states")
+        raise ConfigError(f"{where}: scenes is {brief(scenes)}; map each name to its number of states")
     wrong_numbers = [
         key for key, value in patience.items() if not isinstance(value, int | float) or value <= 0
     ]
     if wrong_numbers:
         key = wrong_numbers[0]
-        raise ConfigError(f"{where}: patience.{key} is {patience[key]!r}; give a number above 0")
+        raise ConfigError(f"{where}: patience.{key} is {brief(patience[key])}; give a number above 0")
     return Archive(
         name,
         str(entry.get("archive") or PurePosixPath(mirrors[0]).name),

@@ -17,6 +17,7 @@ from PIL import Image, ImageOps, UnidentifiedImageError
 
 from vusfa.errors import SceneError
 from vusfa.scenes.graph import default_actions
+from vusfa.scenes.limits import PICTURE_FORMATS
 from vusfa.scenes.pictures import to_jpeg
 from vusfa.scenes.validation import raise_faults
 from vusfa.sources.capture import PoseGraph
@@ -144,7 +145,7 @@ def fit_picture(path: str | os.PathLike[str], width: int, height: int) -> np.nda
         OSError: it is no picture that can be read.
     """
     try:
-        with Image.open(path) as image:
+        with Image.open(path, formats=PICTURE_FORMATS) as image:
             # JPEG files of cameras are large: they can be decoded at half their size, a quarter, ...
             image.draft("RGB", (4 * max(width, height),) * 2)
             upright = ImageOps.exif_transpose(image).convert("RGB")

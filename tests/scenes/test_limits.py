@@ -1,0 +1,134 @@
+"""Files that reach outside themselves or declare more than they hold: one line, and nothing is opened."""
+
+from __future__ import annotations
+
+import io
+import os
+import struct
+import zlib
+from collections.abc import Callable
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+from PIL import Image
+
+from vusfa.errors import SceneError
+from vusfa.scenes import Scene, validate
+from vusfa.scenes.pictures import decode
+
+Make = Callable[..., Path]
+
+
+def fault(path: Path) -> str:
+    """The first fault of a file; loading it fails, too."""
+    faults = validate(path)
+    assert faults
+    with pytest.raises(SceneError, match=r"room\.h5"):
+        Scene.load(path)
+    return faults[0]
+
+
+def test_external_storage_is_refused(make_file: Make, pictures: np.ndarray) -> None:
+    path = make_file()
+    with h5py.File(path, "a") as file:
+        size = os.path.getsize("/etc/passwd")
+        file.create_dataset("observation", (5, 1, 1, 3), "u1", external=[("/etc/passwd", 0, size)])
+    assert "lie outside the file" in fault(path)
+
+
+@pytest.mark.parametrize("name", ["graph", "resnet_feature", "observation"])
+def test_external_links_are_refused_and_not_followed(make_file: Make, tmp_path: Path, name: str) -> None:
+    os.mkfifo(tmp_path / "pipe")  # opening it would hang
+    path = make_file(**({name: None} if name != "observation" else {}))
+    with h5py.File(path, "a") as file:
+        file[name] = h5py.ExternalLink(str(tmp_path / "pipe"), name)
+    assert "link to another place" in fault(path)
+
+
+def test_soft_links_are_refused(make_file: Make) -> None:
+    path = make_file(location=None)
+    with h5py.File(path, "a") as file:
+        file["elsewhere"] = h5py.ExternalLink("/etc/passwd", "/")
+        file["location"] = h5py.SoftLink("/elsewhere/location")
+    assert "dataset 'location' cannot be read (it is a link" in fault(path)
+
+
+def test_virtual_datasets_are_refused(make_file: Make, tmp_path: Path) -> None:
+    path = make_file(rotation=None)
+    layout = h5py.VirtualLayout((5,), "f4")
+    layout[:] = h5py.VirtualSource(str(tmp_path / "other.h5"), "rotation", (5,))
+    with h5py.File(path, "a") as file:
+        file.create_virtual_dataset("rotation", layout)
+    assert "dataset 'rotation' cannot be read (its data lie outside" in fault(path)
+
+
+def test_more_states_than_any_scene_has(make_file: Make) -> None:
+    path = make_file(shortest_path_distance=None)
+    with h5py.File(path, "a") as file:
+        file.create_dataset("shortest_path_distance", (20_000, 20_000), "i2", chunks=True, compression=9)
+    assert "declares 20000 states; at most 16384" in fault(path)
+
+
+def test_declared_bytes_that_are_not_there(make_file: Make) -> None:
+    path = make_file(resnet_feature=None)
+    with h5py.File(path, "a") as file:
+        file.create_dataset("resnet_feature", (5, 1000, 1_000_000), "f4", chunks=True, compression=9)
+    assert "declares 20000000000 bytes, but 0 are stored" in fault(path)
+
+
+def test_raw_pictures_of_a_giant(make_file: Make) -> None:
+    path = make_file()
+    with h5py.File(path, "a") as file:
+        file.create_dataset("observation", (5, 5000, 2, 3), "u1", chunks=True, compression=9)
+    assert "at most 4096 pixels a side" in fault(path)
+
+
+def png(width: int, height: int) -> bytes:
+    """A PNG file of a few bytes that declares any size."""
+
+    def chunk(kind: bytes, data: bytes) -> bytes:
+        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+
+    header = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
+    return (
+        b"\x89PNG\r\n\x1a\n"
+        + chunk(b"IHDR", header)
+        + chunk(b"IDAT", zlib.compress(b""))
+        + chunk(b"IEND", b"")
+    )
+
+
+def eps() -> bytes:
+    buffer = io.BytesIO()
+    Image.new("RGB", (4, 4)).save(buffer, "EPS")
+    return buffer.getvalue()
+
+
+@pytest.mark.parametrize(
+    ("encoded", "message"),
+    [
+        pytest.param(png(50_000, 50_000), "exceeds limit|pixels", id="2.5 billion pixels"),
+        pytest.param(png(10_000, 10_000), "exceeds limit|10000 x 10000 pixels", id="100 million pixels"),
+        pytest.param(png(5000, 1), "5000 x 1 pixels; at most 4096", id="too wide"),
+        pytest.param(eps(), "unknown format", id="EPS"),
+        pytest.param(png(40, 40), ".", id="no pixels"),
+        pytest.param(b"", "unknown format", id="nothing"),
+    ],
+)
+def test_pictures_that_are_refused(make_file: Make, encoded: bytes, message: str) -> None:
+    with pytest.raises(OSError, match=message):
+        decode(encoded)
+    path = make_file()
+    with h5py.File(path, "a") as file:
+        dataset = file.create_dataset("observation_jpeg", (5,), h5py.vlen_dtype(np.uint8))
+        for state in range(5):
+            dataset[state] = np.frombuffer(encoded, np.uint8)
+    assert "dataset 'observation_jpeg', state 0: is no picture" in fault(path)
+
+
+def test_only_regular_files_are_opened(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe.h5")
+    for path in (tmp_path / "pipe.h5", Path("/dev/zero")):
+        assert validate(path) == [f"{path}: is no regular file; check the path"]
