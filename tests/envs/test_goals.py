@@ -232,5 +232,5 @@ def test_a_manifest_beyond_its_limits(scenes: SceneSet, tmp_path: Path, text: st
 
 def test_a_manifest_that_is_a_pipe(scenes: SceneSet, tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "goals.yaml")
-    with pytest.raises(GoalError, match="not a regular file"):
+    with pytest.raises(GoalError, match="no regular file"):
         resolve_goals(scenes, tmp_path / "goals.yaml")

@@ -29,7 +29,7 @@ from torch import Tensor
 from vusfa.errors import GoalError
 from vusfa.scenes import Scene, SceneSet
 from vusfa.scenes.graph import strong_components
-from vusfa.scenes.limits import MAX_MANIFEST_BYTES, brief
+from vusfa.scenes.limits import brief, read_text
 
 __all__ = ["PAPER_MANIFEST", "GoalSpec", "read_manifest", "resolve_goals", "spread_goals"]
 
@@ -96,9 +96,7 @@ def read_manifest(path: str | PathLike[str]) -> dict[str, list[int]]:
     """
     path = Path(path)
     try:
-        if not path.is_file() or path.stat().st_size > MAX_MANIFEST_BYTES:
-            raise OSError(f"not a regular file of at most {MAX_MANIFEST_BYTES} bytes")
-        content = yaml.safe_load(path.read_text(encoding="utf-8"))
+        content = yaml.safe_load(read_text(path))
     except (OSError, UnicodeDecodeError) as error:
         raise GoalError(f"{path}: cannot be read ({error}); goals come from a YAML manifest") from error
     except (yaml.YAMLError, RecursionError) as error:

@@ -1,4 +1,4 @@
-"""Limits of what a file may declare, checked before anything of that size is allocated.
+"""Limits of what a file may declare, checked before anything of that size is allocated or computed.
 
 They are far above every scene that is known and far below what fills a machine.
 """
@@ -6,18 +6,21 @@ They are far above every scene that is known and far below what fills a machine.
 from __future__ import annotations
 
 import reprlib
+from pathlib import Path
 from typing import Any
 
 import h5py
 
 __all__ = [
     "MAX_COMPRESSION",
-    "MAX_MANIFEST_BYTES",
+    "MAX_FURNITURE",
     "MAX_PICTURE_SIDE",
     "MAX_STATES",
+    "MAX_TEXT_BYTES",
     "PICTURE_FORMATS",
     "UNCOMPRESSED_BYTES",
     "brief",
+    "read_text",
     "size_fault",
 ]
 
@@ -31,8 +34,10 @@ PICTURE_FORMATS = ("JPEG", "PNG")
 MAX_COMPRESSION = 200
 #: Datasets of at most this size need not keep to it.
 UNCOMPRESSED_BYTES = 1 << 26
-#: Size of a YAML file of goals or archives.
-MAX_MANIFEST_BYTES = 1 << 20
+#: Size of a YAML file: goals, archives, plans.
+MAX_TEXT_BYTES = 1 << 20
+#: Pieces of furniture, and entries of any other kind, of a plan.
+MAX_FURNITURE = 1000
 
 
 def size_fault(dataset: h5py.Dataset) -> str | None:
@@ -49,7 +54,7 @@ def size_fault(dataset: h5py.Dataset) -> str | None:
 
 
 _BRIEF = reprlib.Repr()
-_BRIEF.maxlevel, _BRIEF.maxlist, _BRIEF.maxdict, _BRIEF.maxstring, _BRIEF.maxother = 3, 10, 10, 200, 200
+_BRIEF.maxlevel, _BRIEF.maxlist, _BRIEF.maxdict, _BRIEF.maxstring, _BRIEF.maxother = 2, 10, 10, 200, 200
 
 
 def brief(value: Any) -> str:
@@ -59,3 +64,17 @@ def brief(value: Any) -> str:
     '[0, 1, 2, 3, 4, 5, 6, 7, 8, 9, ...]'
     """
     return _BRIEF.repr(value)
+
+
+def read_text(path: Path) -> str:
+    """The text of a regular file of at most :data:`MAX_TEXT_BYTES`.
+
+    Raises:
+        OSError: it is larger, no regular file, or cannot be read.
+        UnicodeDecodeError: it is no UTF-8.
+    """
+    if path.exists() and not path.is_file():
+        raise OSError("it is no regular file")
+    if path.stat().st_size > MAX_TEXT_BYTES:
+        raise OSError(f"it has more than {MAX_TEXT_BYTES} bytes")
+    return path.read_text(encoding="utf-8")

@@ -24,7 +24,7 @@ import yaml
 from vusfa.errors import ConfigError, SceneError
 from vusfa.scenes import store
 from vusfa.scenes.hdf5 import opened
-from vusfa.scenes.limits import MAX_MANIFEST_BYTES, brief
+from vusfa.scenes.limits import brief, read_text
 from vusfa.sources.download import Patience, download
 
 __all__ = ["Archive", "archives", "arrived_faults", "fetch"]
@@ -64,9 +64,7 @@ def archives(config: str | os.PathLike[str] | None = None) -> dict[str, Archive]
     """
     path = _CONFIG if config is None else Path(config)
     try:
-        if not path.is_file() or path.stat().st_size > MAX_MANIFEST_BYTES:
-            raise OSError(f"not a regular file of at most {MAX_MANIFEST_BYTES} bytes")
-        entries = yaml.safe_load(path.read_text(encoding="utf-8"))
+        entries = yaml.safe_load(read_text(path))
     except (OSError, UnicodeDecodeError, yaml.YAMLError, RecursionError) as error:
         raise ConfigError(f"{path}: cannot be read as YAML ({error}); correct it") from error
     if not isinstance(entries, dict) or not all(isinstance(entry, dict) for entry in entries.values()):

@@ -161,3 +161,38 @@ def test_a_lintel_is_walked_under_and_shows_no_wall() -> None:
     plan = Plan("a", (3.0, 3.0, 2.6), solids=(Solid((1.0, 0.0, 1.2, 3.0), bottom=2.1),))
     assert plan.obstacles == []
     assert len(plan.walls) == 4
+
+
+@pytest.mark.parametrize(
+    ("entries", "message"),
+    [
+        pytest.param("size: [100000, 100000, 3]", "grid.step: 0.5 makes over 16384", id="cells"),
+        pytest.param("size: [3, 3, 3]\ngrid: {step: 0.0001}", "grid.step: 0.0001 makes over", id="step"),
+        pytest.param(
+            "size: [3, 3, 3]\nfurniture: [" + "{}, " * 100_000 + "{}]",
+            "furniture: has 100001 entries",
+            id="furniture",
+        ),
+        pytest.param(
+            "size: [3, 3, 3]\ncamera: {resolution: [100000, 2]}", "at most 4096 a side", id="picture"
+        ),
+        pytest.param("size: " + "[" * 5000, "is no YAML", id="deep"),
+    ],
+)
+def test_plans_that_would_fill_the_machine(entries: str, message: str) -> None:
+    with pytest.raises(SceneError, match=message):
+        from_yaml(f"name: cell\n{entries}", "cell.yaml")
+
+
+def test_a_plan_of_aliases_is_refused_briefly() -> None:
+    lines = ["name: &a [x, x, x, x, x, x, x, x, x, x]"]
+    for before, key in zip("abcdefg", "bcdefgh", strict=True):
+        lines.append(f"{key}: &{key} [{', '.join([f'*{before}'] * 10)}]")
+    with pytest.raises(SceneError) as caught:
+        from_yaml("\n".join([*lines, "size: *h"]), "cell.yaml")
+    assert len(str(caught.value)) < 5000
+
+
+def test_a_plan_that_is_no_regular_file() -> None:
+    with pytest.raises(SceneError, match=r"/dev/zero: cannot be read .it is no regular file"):
+        load_plan("/dev/zero")

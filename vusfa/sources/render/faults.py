@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 
+from vusfa.scenes.limits import MAX_PICTURE_SIDE, MAX_STATES
 from vusfa.sources.render.outline import Rect
 from vusfa.sources.render.plan import ROLES, Plan
 from vusfa.sources.render.textures import FLOORS, WALLS
@@ -20,6 +21,8 @@ def _numbers(plan: Plan) -> Iterator[str]:
         yield f"size: {list(plan.size)} must be three lengths above 0 (width, depth, height)"
     if not grid.step > 0:
         yield f"grid.step: {grid.step} must be above 0"
+    elif plan.size[0] * plan.size[1] * grid.headings > MAX_STATES * grid.step**2:
+        yield f"grid.step: {grid.step} makes over {MAX_STATES} states; take a longer one or a smaller room"
     if not grid.radius > 0:
         yield f"grid.radius: {grid.radius} must be above 0"
     if grid.headings not in (4, 8):
@@ -32,6 +35,8 @@ def _numbers(plan: Plan) -> Iterator[str]:
         yield f"camera.fov: {camera.fov} must lie in 1..170"
     if min(camera.resolution) < 1:
         yield f"camera.resolution: {list(camera.resolution)} must be two whole numbers above 0"
+    if max(camera.resolution) > MAX_PICTURE_SIDE:
+        yield f"camera.resolution: {list(camera.resolution)} must be at most {MAX_PICTURE_SIDE} a side"
     if camera.samples < 1:
         yield f"camera.samples: {camera.samples} must be 1 or more"
     if camera.exposure is not None and not camera.exposure > 0:

@@ -12,6 +12,7 @@ from typing import Any, Union, get_args, get_origin, get_type_hints
 import yaml
 
 from vusfa.errors import SceneError
+from vusfa.scenes.limits import MAX_FURNITURE, brief, read_text
 from vusfa.sources.render.faults import plan_faults
 from vusfa.sources.render.plan import Plan
 
@@ -76,12 +77,15 @@ def _build(kind: Any, value: Any, where: str, faults: list[str]) -> Any:
     if origin is tuple:
         wanted = get_args(kind)
         if not isinstance(value, list):
-            faults.append(f"{where}: {value!r} must be a list")
+            faults.append(f"{where}: {brief(value)} must be a list")
+            return None
+        if len(value) > MAX_FURNITURE:
+            faults.append(f"{where}: has {len(value)} entries; at most {MAX_FURNITURE} are read")
             return None
         if wanted[-1] is Ellipsis:
             return tuple(_build(wanted[0], item, f"{where}[{k}]", faults) for k, item in enumerate(value))
         if len(value) != len(wanted):
-            faults.append(f"{where}: {value!r} must have {len(wanted)} entries")
+            faults.append(f"{where}: {brief(value)} must have {len(wanted)} entries")
             return None
         return tuple(
             _build(part, item, f"{where}[{k}]", faults)
@@ -99,7 +103,7 @@ def _build(kind: Any, value: Any, where: str, faults: list[str]) -> Any:
     except (OverflowError, ValueError):  # infinity and NaN are no whole numbers
         pass
     names = {float: "a number", int: "a whole number", str: "text", bool: "true or false"}
-    faults.append(f"{where}: {value!r} must be {names[kind]}")
+    faults.append(f"{where}: {brief(value)} must be {names[kind]}")
     return None
 
 
@@ -145,7 +149,7 @@ def from_yaml(text: str, source: str = "plan") -> Plan:
     """
     try:
         content = yaml.safe_load(text)
-    except yaml.YAMLError as error:
+    except (yaml.YAMLError, RecursionError) as error:
         raise SceneError(f"{source}: is no YAML ({error}); correct it") from error
     faults: list[str] = []
     plan = _build_entry(Plan, content, "", faults)
@@ -165,7 +169,7 @@ def load_plan(path: str | os.PathLike[str]) -> Plan:
     """
     path = Path(path)
     try:
-        text = path.read_text(encoding="utf-8")
+        text = read_text(path)
     except (OSError, UnicodeDecodeError) as error:
         raise SceneError(f"{path}: cannot be read ({error}); give the file of a plan in YAML") from error
     return from_yaml(text, str(path))
