@@ -13,7 +13,8 @@ import pytest
 
 from vusfa.errors import ConfigError
 from vusfa.training import make_loggers
-from vusfa.training.loggers import CSVLogger, TensorBoardLogger, WandbLogger
+from vusfa.training.loggers import CSVLogger
+from vusfa.training.trackers import TensorBoardLogger, WandbLogger
 
 CONFIG = {"agent": {"model": "vusfa"}, "seed": 3}
 TABLE = [{"scene": "hall", "success": 0.5}, {"scene": "attic", "success": math.nan}]

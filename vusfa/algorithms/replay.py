@@ -1,4 +1,4 @@
-"""A replay buffer of what the agent walked, and goals for it in hindsight.
+"""Replay buffer with goals named in hindsight.
 
 TorchRL's :class:`~torchrl.data.HERReplayBuffer` keeps one episode after the other and names goals of the same
 episode. Here many environments walk at once and an episode is spread over many batches, half of the goals
@@ -22,7 +22,7 @@ __all__ = ["HindsightReplay", "HindsightSampler", "steps_ahead"]
 
 
 def steps_ahead(clock: Tensor, row: Tensor, num_envs: int, horizon: int) -> Tensor:
-    """How many more of its steps each row's walk has on record, itself included.
+    """Number of recorded steps of each row's walk from that row on, itself included.
 
     Args:
         clock: (N,) int64, time-major: row i + num_envs is the same environment's next step. The clock goes on
@@ -45,8 +45,8 @@ def steps_ahead(clock: Tensor, row: Tensor, num_envs: int, horizon: int) -> Tens
 
 
 class HindsightSampler(RandomSampler):
-    """Draws transitions uniformly and a goal for each: one that the same walk reached a few steps later, or
-    any state of the scene that the agent has ever seen.
+    """Sampler of transitions, uniform, and of a goal for each: one that the same walk reached a few steps
+    later, or any state of the scene that the agent has seen.
 
     It adds ``goal_id``, int64, and ``steps_to_goal``, int64, 0 for a goal of the second kind. Rows come
     sorted by scene and state, which is what per-scene layers are fastest with.
@@ -80,14 +80,14 @@ class HindsightSampler(RandomSampler):
         return self.scene_of >= 0
 
     def see(self, state: Tensor, scene: Tensor) -> None:
-        """The agent has been in these states, ids of any shape, of these scenes."""
+        """Add seen states, ids of any shape, of these scenes."""
         self.scene_of = self.scene_of.to(state.device)
         if not self.seen[state].all():
             self.scene_of[state] = scene
             self._tabulate()
 
     def _tabulate(self) -> None:
-        """Seen states scene by scene: their ids, how many, and where each scene's begin."""
+        """Tabulate seen states by scene: ids, their number, and where each scene begins."""
         known = self.seen.nonzero().squeeze(-1)
         scene = self.scene_of[known]
         self._states = known[scene.argsort(stable=True)]
@@ -109,22 +109,22 @@ class HindsightSampler(RandomSampler):
         return row, {"goal_id": goal, "steps_to_goal": torch.where(chosen, steps, 0)}
 
     def any_seen(self, scene: Tensor) -> Tensor:
-        """One seen state of each of these scenes (n,), drawn uniformly."""
+        """Draw a seen state of each of these scenes (n,), uniformly."""
         draw = torch.rand_like(scene, dtype=torch.float64) * self._number[scene]
         return self._states[self._first[scene] + draw.long()]
 
     def state_dict(self) -> dict[str, Any]:
-        """What it has seen."""
+        """Seen states."""
         return {"scene_of": self.scene_of}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Put back what :meth:`state_dict` gave."""
+        """Restore what :meth:`state_dict` gave."""
         self.scene_of = state_dict["scene_of"]
         self._tabulate()
 
 
 class HindsightReplay:
-    """What the agent walked, fed from a collector's batches and read with goals named in hindsight.
+    """Replay buffer of a collector's batches, read with goals named in hindsight.
 
     Args:
         num_states: of the world.
@@ -174,7 +174,7 @@ class HindsightReplay:
         return len(self.buffer)
 
     def extend(self, batch: TensorDictBase) -> None:
-        """Takes in a collector's batch (num_envs, T), the continuation of the last one.
+        """Add a collector's batch (num_envs, T), the continuation of the last one.
 
         Raises:
             ConfigError: a batch of other environments.
@@ -208,7 +208,7 @@ class HindsightReplay:
         return self.buffer.sample().exclude("index", "clock")
 
     def state_dict(self) -> dict[str, Any]:
-        """What is on record, as tensors and plain data."""
+        """Content, as tensors and plain data."""
         rows = self.buffer[:].to_dict() if len(self) else {}
         return {
             "rows": rows,
@@ -218,7 +218,7 @@ class HindsightReplay:
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Put back what :meth:`state_dict` gave, into a buffer of the same size.
+        """Restore what :meth:`state_dict` gave, into a buffer of the same size.
 
         Raises:
             ConfigError: it is of another number of environments, or longer than the buffer.

@@ -1,4 +1,4 @@
-"""The command line: ``vusfa scenes ...``.
+"""The command line: ``vusfa train ...``, ``vusfa scenes ...``.
 
 One module for each group of commands. Every one has a function ``register(scenes)`` that adds its commands
 to ``vusfa scenes``, and imports what computes (torch, matplotlib, a renderer) only inside them, so that

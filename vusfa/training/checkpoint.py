@@ -1,7 +1,10 @@
-"""A training's whole state in one file, written whole or not at all.
+"""Checkpoints: the whole state of a training in one file, written whole or not at all.
 
 The file holds tensors and plain data only, so that it is read with ``torch.load(weights_only=True)``: opening
-a checkpoint runs no code, wherever it comes from. Its entries:
+a checkpoint runs no code, wherever it comes from. :class:`torchrl.checkpoint.Checkpoint` was looked at and
+left: it writes a folder or archive of components, each restored by its own adapter, where here one mapping
+says what differs before anything is restored. Files of version 0.1 are converted when read
+(:mod:`vusfa.training.upgrade`). The entries:
 
 =========================  ==================================================================================
 ``format``                 version of this layout
@@ -11,7 +14,8 @@ a checkpoint runs no code, wherever it comes from. Its entries:
 ``agent``                  the agent's ``state_dict``
 ``scenes``                 what was given as scenes, their names, and the set's fingerprint
 ``goals``                  (G,) global ids of the goals trained on
-``config``, ``overrides``  the recipe's resolved configuration and the command line that made it
+``config``                 all settings, resolved: those that a resumed run continues with
+``overrides``              the command line that made them, to be read; it is never run
 ``optimizer``              its state
 ``algorithm``              what it has learned besides the agent: multiplier, replay buffer
 ``collector``              environments and the frame they stand at (:mod:`vusfa.training.collectors`)
@@ -115,7 +119,7 @@ def load_checkpoint(path: str | Path, device: torch.device | str = "cpu") -> dic
 
 
 def check_setting(path: str | Path, name: str, saved: Any, wanted: Any) -> None:
-    """Refuse a checkpoint whose setting differs from the one asked for.
+    """Check that a checkpoint was saved with a setting's value of now.
 
     >>> check_setting("a.pt", "agent.model", "usfa", "vusfa")
     Traceback (most recent call last):
@@ -130,7 +134,7 @@ def check_setting(path: str | Path, name: str, saved: Any, wanted: Any) -> None:
 
 
 def check_scenes(path: str | Path, saved: Mapping[str, Any], scenes: SceneSet) -> None:
-    """Refuse a checkpoint whose scenes are not these, number for number.
+    """Check that a checkpoint's scenes are these, number for number.
 
     Raises:
         CheckpointError: other scenes, or scenes of the same names with other content.
@@ -174,7 +178,7 @@ def differences(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
 
 
 def scene_sources(scenes: str | Sequence[str]) -> list[str]:
-    """What was given as scenes, in a form that still works from another folder.
+    """Names and paths of scenes, paths made absolute.
 
     >>> scene_sources("kitchen")
     ['kitchen']

@@ -1,13 +1,13 @@
-"""Who walks while the agent learns: one process, several in step, or several each at its own pace.
+"""Data collection: in one process, or in several that wait for each other or run asynchronously.
 
 ===============  ============================================================================================
 ``single``       the environments step in this process. Runs repeat number for number, and resume so.
-``multi_sync``   worker processes walk with the same weights and wait for each other; a batch holds all rows.
-``multi_async``  worker processes never wait: a batch holds the rows of one worker, whoever is ready. Weights
-                 live in shared memory, so an update reaches walkers in mid-rollout. This field's A3C.
+``multi_sync``   worker processes collect with the same weights and wait for each other; a batch has all rows.
+``multi_async``  worker processes never wait: a batch has the rows of the first that is ready. Weights are in
+                 shared memory, so an update reaches workers in mid-rollout: A3C.
 ===============  ============================================================================================
 
-All rows are dealt the same goals whichever way they are spread over processes.
+Rows get the same goals however they are spread over processes.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ MakeEnv = Callable[..., EnvBase]
 
 
 def make_env(scenes: SceneSet, transforms: Sequence[Transform] = (), **settings: Any) -> EnvBase:
-    """The task, with what the agent needs around it.
+    """Environment of the task, with the transforms that the agent needs.
 
     Args:
         scenes: the world.
@@ -65,7 +65,7 @@ def make_env(scenes: SceneSet, transforms: Sequence[Transform] = (), **settings:
 
 
 def rows_per_worker(kind: str, num_envs: int, num_workers: int) -> int:
-    """How many environments each worker steps.
+    """Number of environments per worker.
 
     Raises:
         ConfigError: unknown kind, or the environments cannot be shared out evenly.
@@ -91,7 +91,7 @@ def rows_per_worker(kind: str, num_envs: int, num_workers: int) -> int:
 
 
 def check_goals_dealt(num_goals: int, num_envs: int, goal_sampling: str) -> None:
-    """Refuse environments too few for goals that stay with their environment: some would never be walked to.
+    """Check that every goal has an environment, where each environment keeps its goal.
 
     >>> check_goals_dealt(num_goals=5, num_envs=4, goal_sampling="fixed")
     Traceback (most recent call last):
@@ -116,7 +116,7 @@ def make_collector(
     seed: int = 0,
     autocast: bool = False,
 ) -> BaseCollector:
-    """A collector that never ends; whoever reads it counts the frames.
+    """Collector without an end; the caller counts frames.
 
     Args:
         kind: ``"single"``, ``"multi_sync"`` or ``"multi_async"``.
@@ -169,7 +169,7 @@ def make_collector(
 
 
 def _begin_worker(autocast: bool) -> None:
-    """First thing in every worker process."""
+    """Initialization of every worker process."""
     ignore_interrupts()
     if autocast:
         torch.set_autocast_dtype("cpu", torch.bfloat16)
@@ -200,10 +200,9 @@ def close_collector(collector: BaseCollector) -> None:
 
 
 def collector_state(collector: BaseCollector) -> dict[str, Any]:
-    """Where the environments stand, as tensors and plain data.
+    """State of the environments, as tensors and plain data.
 
-    Only a single collector can say; one with workers has nothing to give, and begins new episodes when it
-    resumes.
+    Empty for a collector with workers, which begins new episodes when it resumes.
     """
     if not isinstance(collector, Collector):
         return {}
@@ -217,8 +216,7 @@ def collector_state(collector: BaseCollector) -> dict[str, Any]:
 
 
 def load_collector_state(collector: BaseCollector, state: dict[str, Any]) -> None:
-    """Put the environments back to where :func:`collector_state` found them, as far as the kind of collector
-    can.
+    """Restore what :func:`collector_state` gave; nothing for a collector with workers.
 
     Raises:
         CheckpointError: the state is of environments in another number.

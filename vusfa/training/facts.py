@@ -1,4 +1,4 @@
-"""What a training was, in plain data, for whoever keeps its results."""
+"""Facts of a run for its results: model, settings, machine."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def machine_facts() -> dict[str, Any]:
 
 
 def run_facts(state: Mapping[str, Any], overrides: Sequence[str] = ()) -> dict[str, Any]:
-    """Of a checkpoint: model, seed, settings, goals, frames and seconds; and the machine that asks.
+    """Model, seed, settings, goals, frames and seconds of a checkpoint; and this machine.
 
     Args:
         state: as :func:`~vusfa.training.load_agent` returns it.

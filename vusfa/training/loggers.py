@@ -1,51 +1,51 @@
-"""Where numbers go: a CSV file, TensorBoard, Weights & Biases. Each of them a few lines behind one
-protocol."""
+"""Loggers of a training: a CSV file, TensorBoard, Weights & Biases, behind one protocol.
+
+TorchRL's loggers (:mod:`torchrl.record.loggers`) were looked at and left: its CSVLogger writes one file per
+scalar and appends on resuming, where ours is one table whose later rows are taken out first, so that the
+file of a resumed run is that of an uninterrupted one; its TensorboardLogger and WandbLogger add to the
+libraries' own calls neither tables nor checkpoints as artifacts, which are what those here are for.
+"""
 
 from __future__ import annotations
 
 import csv
 import math
-import os
-import shutil
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Protocol
 
-from vusfa.conf.settings import flat
 from vusfa.errors import ConfigError
 from vusfa.files import write_csv, write_json
+from vusfa.training.trackers import TensorBoardLogger, WandbLogger
 
-__all__ = ["CSVLogger", "Logger", "Loggers", "TensorBoardLogger", "WandbLogger", "make_loggers"]
+__all__ = ["CSVLogger", "Logger", "Loggers", "make_loggers"]
 
 
 class Logger(Protocol):
-    """What a training tells of itself."""
+    """Receiver of metrics, checkpoints and tables."""
 
     def log_metrics(self, metrics: Mapping[str, float], frames: int) -> None:
-        """Numbers after so many frames; NaN stands for a rate over nothing."""
+        """Take a row of numbers after ``frames`` frames; NaN: a rate over no episode."""
 
     def log_checkpoint(self, path: Path, frames: int) -> None:
-        """A checkpoint has been written."""
+        """Take note of a written checkpoint."""
 
     def log_table(self, name: str, rows: Sequence[Mapping[str, Any]], frames: int) -> None:
-        """A table of results, such as an evaluation's summary."""
+        """Take a table of results, such as the summary of an evaluation."""
 
     def close(self, exit_code: int = 0) -> None:
-        """Nothing more comes."""
+        """Finish: nothing follows."""
 
 
 class CSVLogger:
-    """``metrics.csv`` with one row a call, ``NAME.csv`` for every table, ``config.json``; needs nothing
-    installed.
+    """CSV files: ``metrics.csv`` with one row per call, ``NAME.csv`` per table; and ``config.json``.
 
-    Rows are appended as they come. Where the file has later rows than ``resume_frames`` (the run went on
-    after its last checkpoint, then died), these are taken out first: a resumed run's file is that of a run
-    without interruption.
+    Rows are appended. Rows later than ``resume_frames`` (the run continued after its last checkpoint, then
+    died) are removed first: the file of a resumed run equals that of an uninterrupted one.
 
     Args:
-        folder: where to.
+        folder: of the files.
         config: written to ``config.json``.
         resume_frames: frames of the checkpoint that the run continues from; None for a new run.
 
@@ -69,7 +69,7 @@ class CSVLogger:
         self._begun = False
 
     def _begin(self) -> None:
-        """Only now, so that a training that cannot begin leaves nothing behind."""
+        """Create the files at the first call: a training that cannot begin leaves none."""
         if self._begun:
             return
         self._begun = True
@@ -84,7 +84,7 @@ class CSVLogger:
             write_csv(self._file, kept, self._columns)
 
     def log_metrics(self, metrics: Mapping[str, float], frames: int) -> None:
-        """Append one row; the first one decides on the columns."""
+        """Append one row; the first row sets the columns."""
         self._begin()
         row = {"frames": frames, **metrics}
         new = self._columns is None
@@ -98,7 +98,7 @@ class CSVLogger:
             writer.writerow({k: "" if isinstance(v, float) and math.isnan(v) else v for k, v in row.items()})
 
     def log_checkpoint(self, path: Path, frames: int) -> None:
-        """The file itself is the record."""
+        """Nothing to do: the file itself is the record."""
         self._begin()
 
     def log_table(self, name: str, rows: Sequence[Mapping[str, Any]], frames: int) -> None:
@@ -107,126 +107,14 @@ class CSVLogger:
         write_csv(self.folder / f"{name}.csv", rows)
 
     def close(self, exit_code: int = 0) -> None:
-        """Nothing is open."""
-
-
-class TensorBoardLogger:
-    """Scalars, the configuration and the tables (as text) in a TensorBoard run; needs ``tensorboard``.
-
-    Args:
-        folder: the run's folder.
-        config: shown under "text".
-    """
-
-    def __init__(self, folder: str | Path, config: Mapping[str, Any]) -> None:
-        from torch.utils.tensorboard import SummaryWriter
-
-        self._writer = SummaryWriter(str(folder))
-        lines = [{"setting": key, "value": value} for key, value in flat(config).items()]
-        self._writer.add_text("config", _markdown(lines))
-
-    def log_metrics(self, metrics: Mapping[str, float], frames: int) -> None:
-        """Every number but NaN, which TensorBoard would draw."""
-        for key, value in metrics.items():
-            if not math.isnan(value):
-                self._writer.add_scalar(key, value, frames)
-
-    def log_checkpoint(self, path: Path, frames: int) -> None:
-        """Its path, as text."""
-        self._writer.add_text("checkpoint", str(path), frames)
-
-    def log_table(self, name: str, rows: Sequence[Mapping[str, Any]], frames: int) -> None:
-        """As text."""
-        self._writer.add_text(name, _markdown(rows), frames)
-
-    def close(self, exit_code: int = 0) -> None:
-        """Write what is left and close the file."""
-        self._writer.close()
-
-
-class WandbLogger:
-    """A run at Weights & Biases: configuration, metrics, checkpoints as artifacts, tables; needs ``wandb``.
-
-    Without a network, ``mode="offline"`` keeps everything in ``folder`` (``wandb sync`` sends it later), or
-    ``mode="disabled"`` does nothing.
-
-    Args:
-        folder: where wandb keeps its files.
-        config: the run's configuration.
-        run_id: the run's id; one that exists already is continued.
-        project: wandb's project.
-        mode: ``"online"``, ``"offline"`` or ``"disabled"``.
-        name: the run's name; wandb makes one up without.
-    """
-
-    def __init__(
-        self,
-        folder: str | Path,
-        config: Mapping[str, Any],
-        run_id: str,
-        project: str = "vusfa",
-        mode: str = "online",
-        name: str | None = None,
-    ) -> None:
-        import wandb
-
-        modes = ("online", "offline", "disabled")
-        if mode not in modes:
-            raise ConfigError(f"logger.mode is {mode!r}; it must be one of {', '.join(modes)}")
-        files = Path(folder) / "wandb"
-        missing = [place for place in (files, *files.parents) if not place.exists()]
-        Path(folder).mkdir(parents=True, exist_ok=True)  # wandb writes elsewhere where there is no folder
-        # Artifacts wait in a staging folder to be sent. By default that is in HOME; keep a run's files
-        # together.
-        os.environ.setdefault("WANDB_DATA_DIR", str(Path(folder).resolve()))
-        self._wandb = wandb
-        try:
-            self.run = wandb.init(
-                dir=str(folder),
-                config=dict(config),
-                project=project,
-                mode=mode,  # type: ignore[arg-type]
-                name=name,
-                id=run_id,
-                resume="allow",
-                settings=wandb.Settings(silent=True),
-            )
-        except Exception as error:  # no key, no network, a project's name that it does not like
-            _take_back(missing)
-            reason = " ".join(str(error).split())
-            raise ConfigError(
-                f"logger wandb cannot begin ({reason}); run 'wandb login', or give logger.mode=offline"
-            ) from error
-        self.run.define_metric("*", step_metric="frames")
-
-    def log_metrics(self, metrics: Mapping[str, float], frames: int) -> None:
-        """Every number but NaN."""
-        self.run.log({"frames": frames, **{k: v for k, v in metrics.items() if not math.isnan(v)}})
-
-    def log_checkpoint(self, path: Path, frames: int) -> None:
-        """The file as a version of the artifact ``checkpoint-RUN``, of type "model"."""
-        artifact = self._wandb.Artifact(
-            f"checkpoint-{self.run.id}", type="model", metadata={"frames": frames}
-        )
-        artifact.add_file(str(path))
-        self.run.log_artifact(artifact)
-
-    def log_table(self, name: str, rows: Sequence[Mapping[str, Any]], frames: int) -> None:
-        """A wandb table."""
-        columns: list[Any] = list(rows[0]) if rows else []
-        data = [[None if _is_nan(row[key]) else row[key] for key in columns] for row in rows]
-        self.run.log({"frames": frames, name: self._wandb.Table(columns=columns, data=data)})
-
-    def close(self, exit_code: int = 0) -> None:
-        """End the run and wait until its files are written or sent."""
-        self.run.finish(exit_code=exit_code)
+        """Nothing to do: no file is open."""
 
 
 class Loggers:
-    """Several loggers as one; whatever happens is told to each. As a context, closes them on the way out.
+    """Several loggers as one. As a context manager it closes them on exit.
 
     Attributes:
-        exit_code: what to close them with; an exception closes them with 1.
+        exit_code: passed to ``close``; 1 after an exception.
     """
 
     def __init__(self, loggers: Sequence[Logger]) -> None:
@@ -273,11 +161,11 @@ def make_loggers(
     mode: str = "online",
     name: str | None = None,
 ) -> Loggers:
-    """Loggers by name: any of ``csv``, ``tensorboard`` and ``wandb``.
+    """Loggers by name: ``csv``, ``tensorboard``, ``wandb``.
 
     Args:
-        kinds: which ones.
-        folder: where their files go.
+        kinds: names.
+        folder: of their files.
         config: the run's configuration, plain data.
         run_id: the run's id, the same when it is resumed.
         resume_frames: frames of the checkpoint that the run continues from; None for a new run.
@@ -303,27 +191,7 @@ def make_loggers(
     return Loggers(loggers)
 
 
-def _markdown(rows: Sequence[Mapping[str, Any]]) -> str:
-    if not rows:
-        return ""
-    lines = [list(rows[0]), ["---"] * len(rows[0]), *([f"{value}" for value in row.values()] for row in rows)]
-    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
-
-
 def _frames(row: Mapping[str, str | None]) -> int:
     """Frames of a row of ``metrics.csv``; a row that was cut off in the writing counts as later than all."""
     complete = None not in row.values()
     return int(row["frames"] or 0) if complete else 1 << 62
-
-
-def _take_back(made: Sequence[Path]) -> None:
-    """Remove folders, the innermost first, with what is in it; an outer one only if nothing else is."""
-    for place in made[:1]:
-        shutil.rmtree(place, ignore_errors=True)
-    for place in made[1:]:
-        with suppress(OSError):
-            place.rmdir()
-
-
-def _is_nan(value: Any) -> bool:
-    return isinstance(value, float) and math.isnan(value)

@@ -1,4 +1,4 @@
-"""What the process does with memory that tensors have given back."""
+"""Reuse of freed memory by the C library."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ _MMAP_THRESHOLD, _TRIM_THRESHOLD = (-3, 32 * 2**20), (-1, 2**31 - 1)
 
 
 def keep_memory() -> bool:
-    """Have the C library keep what tensors free for the next ones.
+    """Have the C library keep freed memory for the next tensors.
 
     As it comes, glibc hands large blocks back to the system at once, and the system fills new ones with zeros
     page by page: of an update's time a tenth or more. The process then holds on to the most that it ever

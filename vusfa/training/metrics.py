@@ -1,7 +1,7 @@
-"""Counts, while training, how the episodes end: per goal, per scene and over all.
+"""Success and length of the training's episodes: per goal, per scene, and over all.
 
-One :meth:`EpisodeMeter.update` an update: a few ``index_add`` over the episodes that ended in the batch,
-nothing per goal in Python. The sums turn into rates only when someone logs them.
+One :meth:`EpisodeMeter.update` per update: a few ``index_add`` over the episodes that ended in the batch,
+nothing per goal in Python. Sums become rates when they are logged.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ class EpisodeMeter:
         self._collisions = torch.zeros((), dtype=torch.int64)
 
     def update(self, batch: TensorDictBase) -> None:
-        """Takes in a collector's batch, of any shape."""
+        """Add a collector's batch, of any shape."""
         after = batch.get("next")
         self._frames += batch.numel()
         self._collisions += after.get("collided").sum().cpu()
@@ -67,10 +67,10 @@ class EpisodeMeter:
         self._sums.index_add_(1, column, torch.stack(rows))
 
     def flush(self) -> dict[str, float]:
-        """The rates since the last call, and starts over.
+        """Return the rates since the last call, and start over.
 
         Returns:
-            ``episodes`` and ``collisions`` (a step); ``success`` (share of the episodes that ended at their
+            ``episodes`` and ``collisions`` (per step); ``success`` (share of the episodes that ended at their
             goal), ``length`` (of an episode, in actions) and ``length_ratio`` (mean length of the successful
             episodes over the mean of their shortest paths) over all goals; the same under ``scene/NAME/``
             and, without the length, under ``goal/NAME/STATE/``. A rate over no episode is NaN. The keys are
@@ -106,7 +106,7 @@ class EpisodeMeter:
 
 
 class MeanMeter:
-    """Means of numbers that every update gives, such as the terms of a loss, since the last :meth:`flush`.
+    """Means since the last :meth:`flush` of numbers that every update gives, such as the terms of a loss.
 
     >>> meter = MeanMeter()
     >>> meter.update({"kl": torch.tensor(0.5)})
@@ -121,14 +121,14 @@ class MeanMeter:
         self._count = 0
 
     def update(self, values: Mapping[str, Tensor]) -> None:
-        """Takes in one number for every name, the same names each time; stays on their device."""
+        """Add one number per name, the same names each time; sums stay on their device."""
         self._names = self._names or list(values)
         row = torch.stack([values[name].detach().to(torch.float64) for name in self._names])
         self._sum = row if self._sum is None else self._sum + row
         self._count += 1
 
     def flush(self) -> dict[str, float]:
-        """The means since the last call, NaN without an update in between, and starts over."""
+        """Return the means since the last call, NaN without an update, and start over."""
         if self._sum is None or not self._count:
             return dict.fromkeys(self._names, math.nan)
         result = dict(zip(self._names, (self._sum / self._count).tolist(), strict=True))

@@ -1,4 +1,4 @@
-"""The live line of a training or an evaluation: how far, how fast, how well, how long to go."""
+"""Progress line of a training or an evaluation: frames, speed, success, time left."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ __all__ = ["EvaluationProgress", "ProgressLine", "describe"]
 
 
 class ProgressLine:
-    """One line that renews itself on a terminal; elsewhere (a file, a pipe) a new line now and then.
+    """Line that is rewritten on a terminal; elsewhere (a file, a pipe) a new line at intervals.
 
     Args:
-        total: frames at which the training ends, or whatever else is counted.
+        total: frames at which the training ends, or another total.
         console: where to write; standard error by default, so that results can be piped.
         every: seconds between lines when the output is not a terminal.
         clock: gives the time in seconds.
@@ -56,12 +56,12 @@ class ProgressLine:
             self._live.start()
 
     def rates(self, success: float, length_ratio: float) -> None:
-        """What the episodes came to lately; NaN keeps what is shown."""
+        """Set success and length ratio; NaN keeps what is shown."""
         self._success = self._success if math.isnan(success) else success
         self._ratio = self._ratio if math.isnan(length_ratio) else length_ratio
 
     def update(self, frames: int) -> None:
-        """So many are done."""
+        """Set how many are done."""
         now = self._clock()
         if self._recent and now - self._recent[0][0] > 30.0:
             self._recent.popleft()
@@ -81,7 +81,7 @@ class ProgressLine:
         self.close()
 
     def close(self) -> None:
-        """Leave the last line standing."""
+        """Finish, leaving the last line."""
         if self._live is not None:
             self._live.stop()
         elif self._line:
@@ -106,7 +106,7 @@ class EvaluationProgress:
         self._line: ProgressLine | None = None
 
     def __call__(self, policy: str, done: int, total: int) -> None:
-        """So many of a policy's episodes are done."""
+        """Set how many of a policy's episodes are done."""
         if policy != self._policy or self._line is None:
             self._close()
             self._policy = policy
@@ -129,7 +129,7 @@ class EvaluationProgress:
 def describe(
     frames: int, total: int, speed: float, success: float, length_ratio: float, unit: str = "frames"
 ) -> str:
-    """The line itself; NaN for what is not known yet.
+    """Text of the line; NaN: not known yet.
 
     >>> describe(250_000, 1_000_000, 5000.0, 0.975, 1.127)
     '250,000 of 1,000,000 frames | 5,000 a second | success 97.5 % | length / shortest 1.13 | 2:30 to go'

@@ -1,4 +1,4 @@
-"""Ctrl-C and SIGTERM as a wish, not a crash: the training ends after the update it is in."""
+"""Ctrl-C and SIGTERM end a training after the current update."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ __all__ = ["StopOnSignal", "ignore_interrupts"]
 
 
 class StopOnSignal:
-    """While in force, the first SIGINT or SIGTERM is noted and the second one acts at once, as without this.
+    """Context manager: the first SIGINT or SIGTERM is recorded; a second one acts at once.
 
     Attributes:
-        received: number of the signal that came, or None.
+        received: number of the signal, or None.
 
     >>> import os
     >>> with StopOnSignal() as stop:
@@ -52,6 +52,5 @@ class StopOnSignal:
 
 
 def ignore_interrupts() -> None:
-    """For worker processes: a terminal sends Ctrl-C to all of them, but only the first process decides to
-    stop."""
+    """Ignore Ctrl-C in a worker process: a terminal sends it to all, and the main process decides."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
