@@ -126,7 +126,7 @@ def test_show_draws_one_png(run: Run, scene_file: Path, monkeypatch: pytest.Monk
     assert result.stdout.splitlines()[0] == "hall: 16 states in 4 places, islands: 0"
     assert result.stdout.splitlines()[-1] == "drawn: hall.png"
     assert "look-alikes: 0.0 % of the states" in result.stdout
-    assert "origin: not told" in result.stdout
+    assert "origin: unknown" in result.stdout
 
 
 def test_show_prints_where_a_scene_comes_from(

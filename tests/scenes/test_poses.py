@@ -11,7 +11,7 @@ import torch
 from vusfa.scenes import Scene
 from vusfa.scenes.poses import places, spread_poses, step_length
 from vusfa.sources.sheet import draw_floor, draw_sheet, save_sheet
-from vusfa.sources.summary import summarise
+from vusfa.sources.summary import summarize
 
 
 @pytest.mark.parametrize(("width", "height"), [(1, 1), (5, 1), (3, 4)])
@@ -55,7 +55,7 @@ def test_a_summary_by_hand() -> None:
     """right, left on a line of three, and an island of one."""
     graph = torch.tensor([[1, -1], [2, 0], [-1, 1], [-1, -1]])
     location = torch.tensor([[0.0, 0.0], [1.0, 0.0], [2.0, 0.0], [9.0, 0.0]])
-    found = summarise(Scene("line", graph, torch.rand(4, 2, 3), location), walk_steps=2)
+    found = summarize(Scene("line", graph, torch.rand(4, 2, 3), location), walk_steps=2)
     assert (found.name, found.states, found.cells, found.actions) == ("line", 4, 4, 2)
     assert (found.crops, found.features, found.islands, found.picture_shape) == (2, 3, 1, None)
     # 0-1, 1-2 both ways are 1; 0-2 both ways are 2
@@ -65,7 +65,7 @@ def test_a_summary_by_hand() -> None:
 
 
 def test_a_summary_without_any_path_is_json_all_the_same() -> None:
-    found = summarise(Scene("spot", torch.tensor([[-1]]), torch.rand(1, 1, 2)))
+    found = summarize(Scene("spot", torch.tensor([[-1]]), torch.rand(1, 1, 2)))
     assert math.isnan(found.mean_path)
     assert found.plain()["mean_path"] is None
     assert found.plain()["random_walk"] is None

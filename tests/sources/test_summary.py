@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from vusfa.scenes import Scene
-from vusfa.sources.summary import by_name, look_alike_share, summarise
+from vusfa.sources.summary import by_name, look_alike_share, summarize
 
 
 def test_look_alikes_are_counted_by_the_nearest_other_state() -> None:
@@ -36,6 +36,6 @@ def test_scenes_of_a_name_are_counted_together_state_by_state() -> None:
         return Scene(name, graph, features[:, None], actions=("there", "back"))
 
     scenes = [line("hall", 4, 2), line("attic", 3, 0), line("hall", 12, 0)]
-    hall, attic = by_name([summarise(scene) for scene in scenes])
+    hall, attic = by_name([summarize(scene) for scene in scenes])
     assert (hall.name, hall.scenes, hall.states, hall.look_alikes, hall.most) == ("hall", 2, 16, 0.125, 0.5)
     assert (attic.name, attic.scenes, attic.states, attic.look_alikes) == ("attic", 1, 3, 0.0)

@@ -1,4 +1,4 @@
-"""The application itself: what all commands have in common."""
+"""The Typer application and the error handling of all commands."""
 
 from __future__ import annotations
 
@@ -43,8 +43,8 @@ scenes = typer.Typer(**_LOOKS)
 app.add_typer(scenes, name="scenes", help="Scenes: look at them, check them, make your own.")
 
 
-def _show_version(wanted: bool) -> None:
-    if wanted:
+def _show_version(requested: bool) -> None:
+    if requested:
         typer.echo(f"vusfa {__version__}")
         raise typer.Exit
 

@@ -42,16 +42,16 @@ def fetch(
     from vusfa.sources.fetch import archives
     from vusfa.sources.fetch import fetch as fetch_archive
 
-    known = archives(config)
-    if name not in known:
-        raise ConfigError(f"no archive is called {name!r}; there are {', '.join(known)}")
+    entries = archives(config)
+    if name not in entries:
+        raise ConfigError(f"no archive is called {name!r}; there are {', '.join(entries)}")
     with resumed("fetching", "B") as report:
         paths = fetch_archive(
-            known[name],
+            entries[name],
             out,
             mirrors=mirror or None,
             progress=report,
             say=lambda line: typer.echo(line, err=True),
         )
     for path in paths:
-        typer.echo(f"{path}: {known[name].scenes[path.stem]} states")
+        typer.echo(f"{path}: {entries[name].scenes[path.stem]} states")

@@ -56,7 +56,7 @@ def list_scenes(
     from vusfa.cli.tables import print_wide, table_of_groups, table_of_scenes
     from vusfa.scenes import Scene, bundled_names
     from vusfa.scenes.store import bundled_path
-    from vusfa.sources.summary import by_name, summarise
+    from vusfa.sources.summary import by_name, summarize
 
     bundled = {name: bundled_path(name) for name in bundled_names()}
     paths = _find(sources, bundled)
@@ -64,7 +64,7 @@ def list_scenes(
     with progress("measuring", len(paths), "scenes") as advance:
         for path in paths:
             try:
-                rows.append((path, summarise(Scene.load(path), walk_steps)))
+                rows.append((path, summarize(Scene.load(path), walk_steps)))
             except SceneError as error:
                 rows.append((path, error))
             advance()
@@ -153,10 +153,10 @@ def show(
     """
     from vusfa.scenes import SceneSet
     from vusfa.sources.sheet import save_sheet
-    from vusfa.sources.summary import summarise
+    from vusfa.sources.summary import summarize
 
     (loaded,) = SceneSet.open(scene).scenes
-    for line in _description(loaded, summarise(loaded)):
+    for line in _description(loaded, summarize(loaded)):
         typer.echo(line)
     typer.echo(f"drawn: {save_sheet(loaded, output or Path(Path(scene).stem + '.png'), pictures)}")
 
@@ -174,7 +174,7 @@ def _description(scene: Scene, summary: Summary) -> list[str]:
         f"random walk: {100 * summary.random_walk:.1f} % success in {summary.walk_steps} actions",
     ]
     origin = Provenance.of(scene.attributes).attributes()
-    lines += ["origin:" + ("" if origin else " not told")]
+    lines += ["origin:" + ("" if origin else " unknown")]
     lines += _indented(origin)
     other = Provenance.other(scene.attributes)
     if other:

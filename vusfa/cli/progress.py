@@ -1,4 +1,4 @@
-"""How far a command is: done of all, rate, time to go."""
+"""Progress of a command: items done, rate, time to go."""
 
 from __future__ import annotations
 

@@ -25,7 +25,7 @@ def _plan(plan: Path | None, kind: str | None, flat: str | None, seed: int, cell
     from vusfa.sources.render.layout import layout
     from vusfa.sources.render.plan_file import load_plan
 
-    if sum(given is not None for given in (plan, kind, flat)) != 1:
+    if sum(source is not None for source in (plan, kind, flat)) != 1:
         raise ConfigError("say what to render: --plan FILE, --kind KIND or --flat KIND,KIND,...")
     if plan is not None:
         if cells is not None:
@@ -116,7 +116,7 @@ def render(
     network = load_backbone(backbone, weights=weights)
     with resumed("rendering", "frames") as frames, resumed("encoding", "pictures") as features:
         reports = {"frames": frames, "features": features}
-        made = render_room(
+        rendered = render_room(
             room,
             target,
             lambda what, done, total: reports[what](done, total),
@@ -125,4 +125,4 @@ def render(
             threads=threads,
             say=lambda line: typer.echo(line, err=True),
         )
-    typer.echo(str(made))
+    typer.echo(str(rendered))

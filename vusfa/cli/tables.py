@@ -1,4 +1,4 @@
-"""What ``vusfa scenes list`` prints."""
+"""Tables of ``vusfa scenes list``."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How an agent lives in a world of scenes: the navigation task for TorchRL and Gymnasium.
+"""The navigation task for TorchRL and Gymnasium.
 
 >>> from vusfa.scenes import SceneSet
 >>> env = TargetNavEnv(SceneSet.bundled(["bathroom"]), goals="paper", batch_size=[5], seed=0)

@@ -36,8 +36,7 @@ GOAL_REWARD, STEP_REWARD = 1.0, -0.01
 
 
 class Rewards(NamedTuple):
-    """What a step earns: three scalars as 0-dimensional float32 tensors, so that the reward's type never
-    varies.
+    """Rewards of a step: three scalars as 0-dimensional float32 tensors, so that the type never varies.
 
     >>> Rewards.of(goal=10.0, step=-0.01, collision=-0.1).collision
     tensor(-0.1000)
@@ -59,7 +58,7 @@ class Rewards(NamedTuple):
 
 
 class Transition(NamedTuple):
-    """What one step leads to; shapes for a batch ``(*B,)`` of agents and a history of ``H`` frames.
+    """Result of one step; shapes for a batch ``(*B,)`` of agents and a history of ``H`` frames.
 
     Attributes:
         state_id: (*B, H) int64, oldest first; ``[..., -1]`` is where the agent now is.

@@ -1,6 +1,6 @@
-"""Which states are goals.
+"""Goal sets.
 
-A goal set is written down in one of these forms, everywhere that goals can be given:
+Wherever an argument or setting names goals, it takes one of these forms:
 
 =================  =======================================================================================
 ``"paper"``        the paper's 20 in the paper's scenes (``manifests/paper.yaml``); five in any other scene,
@@ -186,13 +186,13 @@ def _by_scene(scenes: SceneSet, goals: Mapping[str, Any], source: str) -> Tensor
         raise GoalError(f"{source} name the scene {unknown[0]!r}; this set has {', '.join(scenes.names)}")
     found = []
     for scene, first in _scenes_and_offsets(scenes):
-        given = goals.get(scene.name, [])
-        ids = _as_tensor(given, f"{source}: scene {scene.name!r}")
+        entry = goals.get(scene.name, [])
+        ids = _as_tensor(entry, f"{source}: scene {scene.name!r}")
         if ids.ndim == 1 and not len(ids):
             continue
         if ids.ndim != 1 or ids.is_floating_point() or ids.is_complex() or ids.dtype == torch.bool:
             raise GoalError(
-                f"{source}: scene {scene.name!r} has {brief(given)}; give a list of state ids, like [26, 37]"
+                f"{source}: scene {scene.name!r} has {brief(entry)}; give a list of state ids, like [26, 37]"
             )
         wrong = ids[(ids < 0) | (ids >= scene.num_states)]
         if len(wrong):

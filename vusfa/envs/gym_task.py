@@ -1,4 +1,4 @@
-"""What the single and the vector version of the Gymnasium task share: a batched environment, in NumPy."""
+"""Common part of the single and the vector Gymnasium environment: a batched environment, in NumPy."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ class _Rows(TargetNavEnv):
 
 
 class GymTask:
-    """What the single and the vector version share: the rows, where they are, and how they are seen."""
+    """Rows of a batched environment, their data and their observations."""
 
     def __init__(
         self,
@@ -116,7 +116,7 @@ class GymTask:
         }
 
     def info(self) -> dict[str, np.ndarray]:
-        """What the rows may be told besides, (n,) each."""
+        """Additional facts about the rows, (n,) each."""
         collided, path = (self.data.get(key)[:, 0].numpy() for key in ("collided", "shortest_path"))
         return {"collided": collided.copy(), "shortest_path": path.copy()}
 

@@ -1,8 +1,7 @@
-"""What an agent sees, for pipelines that want to be given it: state ids become features or pixels.
+"""Observations for networks that read features or pixels instead of state ids.
 
-Our own agents are given ids and look features up themselves, so that no feature travels through collectors,
-buffers and pipes. :class:`SceneObservation` writes the same numbers into the data, for whoever brings a
-network of their own.
+The agents of this package read ids and look features up themselves, so that no feature travels through
+collectors, buffers and pipes. :class:`SceneObservation` writes the same numbers into the data.
 """
 
 from __future__ import annotations
@@ -25,7 +24,7 @@ __all__ = ["SceneObservation", "observation_table"]
 
 
 def observation_table(scenes: SceneSet, kind: str, size: tuple[int, int] | None = None) -> Tensor:
-    """What every state of a set looks like.
+    """Table of the observation in every state of a set.
 
     Args:
         scenes: the world.

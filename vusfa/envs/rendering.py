@@ -1,6 +1,6 @@
-"""Pictures of an agent in a scene: what it sees, what it looks for, and the scene from above.
+"""Rendering: an agent's view, its goal, and a map of the scene.
 
-Drawn with Pillow alone, so that an environment can be watched wherever it can be run.
+Pillow alone draws them, so that an environment can be watched wherever it runs.
 """
 
 from __future__ import annotations
@@ -107,17 +107,17 @@ def draw_map(scene: Scene, trail: Sequence[int], goal: int, size: int = _HEIGHT)
     path = [pixel(scene.location[state]) for state in trail]
     draw.line(path, fill=_TRAIL, width=max(_SMOOTH, int(half / 3)), joint="curve")
     dart = max(half * 0.9, side * 0.04)  # to be seen in large rooms, too
-    for state, colour, length in ((goal, _GOAL, dart), (trail[-1], _AGENT, dart * 0.9)):
-        draw.polygon(_arrow(pixel(scene.location[state]), float(scene.rotation[state]), length), fill=colour)
+    for state, color, length in ((goal, _GOAL, dart), (trail[-1], _AGENT, dart * 0.9)):
+        draw.polygon(_arrow(pixel(scene.location[state]), float(scene.rotation[state]), length), fill=color)
     return np.asarray(image.resize((size, size), Image.Resampling.LANCZOS))
 
 
-def _arrow(centre: _Point, heading: float, length: float) -> list[_Point]:
-    """A dart at ``centre`` that points to ``heading`` degrees, 0 = up, 90 = right."""
+def _arrow(center: _Point, heading: float, length: float) -> list[_Point]:
+    """A dart at ``center`` that points to ``heading`` degrees, 0 = up, 90 = right."""
     corners = []
     for turn, reach in ((0.0, 1.0), (140.0, 1.0), (180.0, 0.35), (220.0, 1.0)):
         angle = math.radians(heading + turn)
         corners.append(
-            (centre[0] + math.sin(angle) * reach * length, centre[1] - math.cos(angle) * reach * length)
+            (center[0] + math.sin(angle) * reach * length, center[1] - math.cos(angle) * reach * length)
         )
     return corners

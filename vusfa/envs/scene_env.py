@@ -1,4 +1,4 @@
-"""What environments over scenes have in common: arguments that show, a generator, a device, pictures."""
+"""Base class of environments over scenes: signature, random generator, device, rendering."""
 
 from __future__ import annotations
 

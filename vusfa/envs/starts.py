@@ -1,4 +1,4 @@
-"""Where episodes begin: uniformly over the states that can reach the goal in more than 0 steps.
+"""Distribution of start states: uniform over the states that can reach the goal in more than 0 steps.
 
 The states that can reach a goal are the ancestors of its strongly connected component, so all goals of one
 component share one list, and a room without one-way doors needs a single list for all its goals: memory grows
@@ -26,8 +26,7 @@ DRAW_LIMIT = 2**62
 
 
 class GoalTable(NamedTuple):
-    """Facts about goals, one entry a goal (G,), or one a row (*B,) once looked up with :meth:`take`; all
-    int64.
+    """Facts about goals, one entry per goal (G,), or per row (*B,) after :meth:`take`; int64.
 
     Attributes:
         goal: global state id.
@@ -53,7 +52,7 @@ class GoalTable(NamedTuple):
 
 
 class StartTable(NamedTuple):
-    """All that a sampler of episodes needs.
+    """Tables of a sampler of episodes.
 
     Attributes:
         goals: the goals, in the order given.

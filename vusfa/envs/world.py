@@ -1,4 +1,4 @@
-"""What :class:`TargetNavEnv` is built from: the tables that a step looks into, and the specs of its data."""
+"""Lookup tables and specs of :class:`vusfa.envs.TargetNavEnv`."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ __all__ = ["Specs", "World", "env_specs", "make_world", "map_tensors"]
 
 
 class World(NamedTuple):
-    """The tables of an environment. Not buffers of it: nn.Module finds those ten times slower.
+    """Lookup tables of an environment. No buffers: access to those takes ten times as long.
 
     Attributes:
         successor: (S, A) int64, where each action leads.
         blocked: (S, A) bool.
-        rewards: what a step earns.
-        starts: where episodes begin.
+        rewards: reward of a step.
+        starts: distribution of start states.
         rows: the goal of each row, columns (*B,); None when goals are drawn.
         distance: shortest paths, flat, scene after scene (``SceneSet.distance_tables``).
     """
@@ -77,7 +77,7 @@ def map_tensors(function: Callable[[Tensor], Tensor], tables: Any) -> Any:
 
 
 class Specs(NamedTuple):
-    """What TorchRL wants to know of an environment's data."""
+    """TorchRL specs of an environment's data."""
 
     state: Composite
     observation: Composite

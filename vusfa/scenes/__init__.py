@@ -1,4 +1,4 @@
-"""Rooms as graphs of photographed poses: what the world is.
+"""Scenes: rooms as graphs of photographed poses.
 
 >>> from vusfa.scenes import SceneSet
 >>> SceneSet.bundled()

@@ -88,7 +88,7 @@ def _breadth_first(edges: sparse.csr_matrix, sources: np.ndarray) -> np.ndarray:
 
 
 def default_actions(num_actions: int) -> tuple[str, ...]:
-    """Names for actions that have none: the THOR v1 dumps' four in their order, numbers for any other count.
+    """Default names of actions: those of the THOR v1 dumps when there are four, numbers for any other count.
 
     >>> default_actions(4)
     ('MoveForward', 'RotateRight', 'RotateLeft', 'MoveBackward')

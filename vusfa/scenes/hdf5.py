@@ -1,4 +1,4 @@
-"""Opening and replacing HDF5 files: no handle outlives its block, and nobody ever sees half a file."""
+"""Opening and replacing HDF5 files: no handle outlives its block, and files are replaced atomically."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a scene's poses say: how far apart its places are, and which poses show most of the room."""
+"""Geometry of a scene's poses: distance between places, and a selection of poses spread over the room."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def step_length(location: Tensor) -> float:
 
 
 def spread_poses(location: Tensor, rotation: Tensor, count: int) -> list[int]:
-    """States whose poses lie far from one another, in place and in heading: what to show of a room.
+    """Select states whose poses lie far from one another, in place and in heading.
 
     The first is the one nearest to the middle; each further one is the pose that is farthest from all before
     it. Opposite headings count as far apart as half of the room.

@@ -1,6 +1,6 @@
-"""Where a scene comes from: who made it, with what, from which plan and seed, under which licences.
+"""Provenance of a scene: who made it, with what, from which plan and seed, under which licences.
 
-These are attributes of the scene's file, one for each field of :class:`Provenance`; what is not known is
+These are attributes of the scene's file, one per field of :class:`Provenance`; unknown ones are
 left out. A scene carries them in :attr:`vusfa.scenes.Scene.attributes`, beside whatever else its maker wrote
 there.
 """
@@ -21,7 +21,7 @@ __all__ = ["Provenance", "this_tool", "today"]
 
 @dataclass(frozen=True)
 class Provenance:
-    """What a scene's file says of its origin.
+    """The origin of a scene, as its file records it.
 
     Args:
         made_with: tools and their versions, as :func:`this_tool` writes them.
@@ -49,17 +49,17 @@ class Provenance:
 
     @classmethod
     def of(cls, attributes: Mapping[str, Any]) -> Provenance:
-        """The origin that a scene's attributes tell; files of other programs may tell none.
+        """Read the origin from a scene's attributes; files of other programs may have none.
 
         >>> Provenance.of({"seed": 1, "licences": "CC0", "exposure": 2.2})
         Provenance(made_with=None, ..., seed=1, licences=('CC0',), credits=())
         """
-        known: dict[str, Any] = {name: attributes[name] for name in _NAMES if name in attributes}
+        values: dict[str, Any] = {name: attributes[name] for name in _NAMES if name in attributes}
         for name in ("licences", "credits"):
-            if name in known:
-                value = known[name]
-                known[name] = tuple(map(str, value)) if isinstance(value, list | tuple) else (str(value),)
-        return cls(**known)
+            if name in values:
+                value = values[name]
+                values[name] = tuple(map(str, value)) if isinstance(value, list | tuple) else (str(value),)
+        return cls(**values)
 
     def attributes(self) -> dict[str, Any]:
         """As attributes of a scene: ``Scene(..., attributes={**origin.attributes(), ...})``."""

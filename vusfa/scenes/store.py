@@ -203,12 +203,14 @@ def write(
         raw = [pictures]
     elif pictures is not None:
         jpegs = list(pictures)
-    given = pictures if isinstance(pictures, np.ndarray) else jpegs
-    if given is not None and len(given) != num_states:
-        raise SceneError(f"{path}: {len(given)} pictures for {num_states} states; give one for each")
-    if isinstance(given, np.ndarray) and (given.dtype != np.uint8 or given.ndim != 4 or given.shape[3] != 3):
+    supplied = pictures if isinstance(pictures, np.ndarray) else jpegs
+    if supplied is not None and len(supplied) != num_states:
+        raise SceneError(f"{path}: {len(supplied)} pictures for {num_states} states; give one for each")
+    if isinstance(supplied, np.ndarray) and (
+        supplied.dtype != np.uint8 or supplied.ndim != 4 or supplied.shape[3] != 3
+    ):
         raise SceneError(
-            f"{path}: pictures are {given.dtype} of shape {given.shape}; give uint8 (N, H, W, 3)"
+            f"{path}: pictures are {supplied.dtype} of shape {supplied.shape}; give uint8 (N, H, W, 3)"
         )
     with replaced(path) as file:
         _write_attributes(file, {**attributes, "scene": name, "actions": list(actions)})

@@ -1,8 +1,9 @@
-"""What can be wrong with a scene's numbers, said so that it can be mended.
+"""Validation of a scene's arrays.
 
-Pure functions of arrays, each of which gives a list of faults: one line per kind of fault, naming the
-dataset, the first state concerned and how many there are. An empty list means that the scene can be used.
-Islands (states that some others cannot reach) are no fault; :attr:`vusfa.scenes.Scene.islands` reports them.
+Pure functions of arrays, each of which returns a list of faults: one line per kind of fault, naming the
+dataset, the first state concerned, how many there are and how to correct it. An empty list means that the
+scene can be used. Islands (states that some others cannot reach) are no fault;
+:attr:`vusfa.scenes.Scene.islands` reports them.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ __all__ = [
     "shape_fault",
 ]
 
-#: What a scene consists of: shape, kinds of dtype, and their name. N states, A actions, C crops, F features.
+#: The datasets of a scene: shape, kinds of dtype, and their name. N states, A actions, C crops, F features.
 DATASETS: dict[str, tuple[str, str, str]] = {
     "graph": ("(N, A)", "iu", "integers"),
     "resnet_feature": ("(N, C, F)", "f", "floats"),

@@ -149,10 +149,10 @@ def load_backbone(
             f"no backbone is called {name!r}; there are {DEFAULT}, torchvision:MODEL, timm:MODEL,"
             f" and files that end in .pt (TorchScript) or .onnx"
         )
-    given = {key: value for key, value in preprocessing.items() if value is not None}
-    if "size" in given:
-        given.setdefault("resize", 0)
-    backbone = replace(backbone, preprocessing=replace(backbone.preprocessing, **given), device=device)
+    options = {key: value for key, value in preprocessing.items() if value is not None}
+    if "size" in options:
+        options.setdefault("resize", 0)
+    backbone = replace(backbone, preprocessing=replace(backbone.preprocessing, **options), device=device)
     if isinstance(backbone.network, nn.Module):
         backbone.network.eval().to(device).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     elif device != "cpu":
@@ -160,8 +160,8 @@ def load_backbone(
     return backbone
 
 
-def _refuse(name: str, **given: Any) -> None:
-    for key, value in given.items():
+def _refuse(name: str, **options: Any) -> None:
+    for key, value in options.items():
         if value is not None:
             raise ConfigError(f"{name}: {key} is {value}, but this network has its own; leave it out")
 

@@ -1,4 +1,4 @@
-"""The one way from poses, moves and pictures to a scene file; every source of scenes ends here.
+"""Pipeline from poses, moves and pictures to a scene file, shared by all sources of scenes.
 
 A source finds out what the states are and where the actions lead (:class:`PoseGraph`) and how to get their
 pictures. :func:`capture` encodes the pictures, in steps that are kept on disk, adds the provenance, checks

@@ -1,4 +1,4 @@
-"""Pictures to features: what the agent sees of a room.
+"""Encoding of pictures into features.
 
 :func:`encode_pictures` is for pictures in memory, :func:`encode_scene` for a scene file. The latter can be
 stopped at any moment and started again; it goes on where it was, and writes the new file in one piece. The

@@ -40,7 +40,7 @@ class Archive:
         name: what ``fetch`` calls it.
         archive: the zip file's name.
         mirrors: its addresses, in the order in which they are asked.
-        scenes: the scenes wanted, ``NAME.h5`` anywhere in the archive, and how many states each has.
+        scenes: the scenes to take, ``NAME.h5`` anywhere in the archive, and how many states each has.
         patience: how long to bear with a server.
         about: one line for people.
     """
@@ -73,12 +73,12 @@ def archives(config: str | os.PathLike[str] | None = None) -> dict[str, Archive]
 
 
 def _archive(where: str, name: str, entry: dict[str, Any]) -> Archive:
-    known = {item.name for item in fields(Archive)} - {"name"}
+    keys = {item.name for item in fields(Archive)} - {"name"}
     patience_keys = {item.name for item in fields(Patience)}
     patience = entry.get("patience") or {}
-    wrong = sorted(set(entry) - known) + [f"patience.{key}" for key in sorted(set(patience) - patience_keys)]
+    wrong = sorted(set(entry) - keys) + [f"patience.{key}" for key in sorted(set(patience) - patience_keys)]
     if wrong:
-        raise ConfigError(f"{where}: there is no key {wrong[0]!r}; the keys are {', '.join(sorted(known))}")
+        raise ConfigError(f"{where}: there is no key {wrong[0]!r}; the keys are {', '.join(sorted(keys))}")
     mirrors, scenes = entry.get("mirrors"), entry.get("scenes")
     if not isinstance(mirrors, list) or not all(isinstance(url, str) for url in mirrors) or not mirrors:
         raise ConfigError(f"{where}: mirrors is {brief(mirrors)}; list one address or more")
@@ -139,10 +139,10 @@ def fetch(
     Raises:
         SceneError: no mirror gave an archive that passes; the message says what each one did.
     """
-    folder, tell = Path(folder), say or (lambda line: None)
+    folder, report = Path(folder), say or (lambda line: None)
     targets = {name: folder / f"{name}.h5" for name in archive.scenes}
     if all(t.exists() and not arrived_faults(t, archive.scenes[n]) for n, t in targets.items()):
-        tell(f"{folder}: all scenes are there and sound")
+        report(f"{folder}: all scenes are there and sound")
         return list(targets.values())
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -155,22 +155,22 @@ def fetch(
         for attempt in ("found here", "fetched"):
             try:
                 if not packed.exists():
-                    tell(f"fetching {url}")
+                    report(f"fetching {url}")
                     download(url, packed, archive.patience, progress, sleep)
                     attempt = "fetched"
-                tell(f"unpacking and checking {packed.name}")
+                report(f"unpacking and checking {packed.name}")
                 _admit(packed, archive, targets)
                 packed.unlink()
                 return list(targets.values())
             except _Unsound as fault:
                 packed.unlink(missing_ok=True)
-                tell(f"thrown away: {fault}")
+                report(f"thrown away: {fault}")
                 if attempt == "fetched":
                     failures.append(f"{url}: {fault}")
                     break
             except SceneError as error:
                 failures.append(str(error))
-                tell(f"failed: {error}")
+                report(f"failed: {error}")
                 break
     lines = "".join(f"\n  - {line}" for line in failures)
     raise SceneError(f"{archive.name}: no mirror gave it; name another one{lines}")
@@ -200,12 +200,12 @@ def _admit(packed: Path, archive: Archive, targets: dict[str, Path]) -> None:
         shutil.rmtree(workshop, ignore_errors=True)
 
 
-def _unpack(packed: Path, wanted: dict[str, Path]) -> None:
+def _unpack(packed: Path, targets: dict[str, Path]) -> None:
     """Files of a zip archive by their last name, wherever they lie in it."""
     try:
         with zipfile.ZipFile(packed) as file:
             members = {PurePosixPath(name).name: name for name in file.namelist() if "__MACOSX" not in name}
-            for name, path in wanted.items():
+            for name, path in targets.items():
                 if f"{name}.h5" not in members:
                     raise _Unsound(f"{packed.name} has no {name}.h5")
                 with file.open(members[f"{name}.h5"]) as source, open(path, "wb") as copy:

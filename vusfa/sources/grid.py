@@ -1,4 +1,4 @@
-"""Poses to a graph: which pose every action leads to, when the poses lie on a grid.
+"""Graph of poses that lie on a grid: which pose every action leads to.
 
 Measured poses are a little off. The grid that fits most of them is found first (step, turn, where it lies,
 how it is turned); then every pose takes its nearest grid point, and one too far from any is said to be. In
@@ -133,8 +133,8 @@ def fit_lattice(place: np.ndarray, basis: complex, fixed_step: bool = False) -> 
         cell = np.rint(along.real) + 1j * np.rint(along.imag)
         used = near & (np.abs(along - cell) <= _OFF_PLACE)
         if len(np.unique(cell[used])) > 1:
-            centred = cell[used] - cell[used].mean()
-            slope = (np.conj(centred) * place[used]).sum() / (np.abs(centred) ** 2).sum()
+            centered = cell[used] - cell[used].mean()
+            slope = (np.conj(centered) * place[used]).sum() / (np.abs(centered) ** 2).sum()
             basis = complex(slope / abs(slope) * abs(basis) if fixed_step else slope)
         if used.any():
             origin = complex((place[used] - basis * cell[used]).mean())

@@ -68,8 +68,8 @@ def lay_out(
     folder = Path(folder)
     if not folder.is_dir():
         raise SceneError(f"{folder}: there is no such folder; check the path")
-    poses = _given_or_there(folder, poses, "poses.csv")
-    edges = _given_or_there(folder, edges, "edges.csv")
+    poses = _table_path(folder, poses, "poses.csv")
+    edges = _table_path(folder, edges, "edges.csv")
     if edges is not None:
         if step is not None or turn is not None:
             raise SceneError(f"{edges}: says where the actions lead; leave out step and turn")
@@ -82,9 +82,9 @@ def lay_out(
     )
 
 
-def _given_or_there(folder: Path, given: str | os.PathLike[str] | None, name: str) -> Path | None:
-    if given is not None:
-        return Path(given)
+def _table_path(folder: Path, path: str | os.PathLike[str] | None, name: str) -> Path | None:
+    if path is not None:
+        return Path(path)
     return folder / name if (folder / name).is_file() else None
 
 
@@ -136,7 +136,7 @@ def _left_out(folder: Path, files: Sequence[str]) -> tuple[str, ...]:
 
 
 def fit_picture(path: str | os.PathLike[str], width: int, height: int) -> np.ndarray:
-    """Read a photograph upright, cut it around its middle to the shape wanted, and make it small.
+    """Read a photograph upright, crop it around its middle to the requested shape, and scale it down.
 
     Returns:
         (height, width, 3) uint8.

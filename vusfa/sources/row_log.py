@@ -1,4 +1,4 @@
-"""Work that can be stopped at any moment: rows of numbers, appended to a file, each with its checksum.
+"""Resumable work: rows of numbers, appended to a file, each with its checksum.
 
 A long command (encoding, exporting) appends every row that it has finished. Stopped and started again, it
 goes on after the last row that arrived whole; a row that was torn by the stop is dropped. When the product

@@ -134,9 +134,9 @@ def draw_floor(axis: Axes, scene: Scene, shown: Sequence[int]) -> None:
     axis.add_collection(PatchCollection(squares, facecolor=_FLOOR, edgecolor=_EDGE, linewidth=0.8))
     angle = np.radians(scene.rotation.double().numpy())
     ahead = np.stack([np.sin(angle), np.cos(angle)]) * cell
-    colours = np.full(scene.num_states, _POSE, dtype=object)
-    colours[[state for island in scene.islands for state in island]] = _ISLAND
-    colours[list(shown)] = _SHOWN
+    colors = np.full(scene.num_states, _POSE, dtype=object)
+    colors[[state for island in scene.islands for state in island]] = _ISLAND
+    colors[list(shown)] = _SHOWN
     darts: dict[str, Any] = {
         "angles": "xy",
         "scale_units": "xy",
@@ -146,7 +146,7 @@ def draw_floor(axis: Axes, scene: Scene, shown: Sequence[int]) -> None:
     }
     # From near the middle outwards, so that the headings of one place do not cover each other.
     tail_x, tail_z = x + 0.12 * ahead[0], z + 0.12 * ahead[1]
-    axis.quiver(tail_x, tail_z, *(0.26 * ahead), color=list(colours), headwidth=4, headlength=4, **darts)
+    axis.quiver(tail_x, tail_z, *(0.26 * ahead), color=list(colors), headwidth=4, headlength=4, **darts)
     axis.set_xlim(x.min() - cell, x.max() + cell)
     axis.set_ylim(z.min() - cell, z.max() + cell)
     for number, state in enumerate(shown, 1):

@@ -1,4 +1,4 @@
-"""A scene in numbers: how large it is, how far its ways are, how well a random walk does."""
+"""Statistics of a scene: size, path lengths, look-alikes, success of a random walk."""
 
 from __future__ import annotations
 
@@ -11,11 +11,12 @@ from typing import Any
 import numpy as np
 import torch
 
+from vusfa.deprecated import moved_names
 from vusfa.scenes.markov import random_walk_success
 from vusfa.scenes.poses import places
 from vusfa.scenes.scene import Scene
 
-__all__ = ["LOOK_ALIKE", "Group", "Summary", "by_name", "look_alike_share", "summarise"]
+__all__ = ["LOOK_ALIKE", "Group", "Summary", "by_name", "look_alike_share", "summarize"]
 
 #: Two states whose features' cosine is at least this look alike.
 LOOK_ALIKE = 0.999
@@ -59,14 +60,14 @@ class Summary:
         return {k: None if isinstance(v, float) and math.isnan(v) else v for k, v in fields.items()}
 
 
-def summarise(scene: Scene, walk_steps: int = 500) -> Summary:
+def summarize(scene: Scene, walk_steps: int = 500) -> Summary:
     """Measure a scene; seconds for some thousand states.
 
     Args:
         scene: the scene.
         walk_steps: actions that the random walk has.
 
-    >>> room = summarise(Scene.bundled("bathroom"))
+    >>> room = summarize(Scene.bundled("bathroom"))
     >>> room.states, room.cells, room.islands, room.look_alikes, room.longest_path, round(room.random_walk, 3)
     (176, 44, 0, 0.0, 21, 0.566)
     """
@@ -111,7 +112,7 @@ def look_alike_share(features: np.ndarray) -> float:
 
 @dataclass(frozen=True)
 class Group:
-    """How well the states of all scenes of one name can be told apart.
+    """How distinguishable the states of all scenes of one name are.
 
     Attributes:
         name: theirs.
@@ -131,7 +132,7 @@ class Group:
 def by_name(found: Sequence[Summary]) -> list[Group]:
     """Scenes of the same name together, in the order in which names come first.
 
-    >>> room = summarise(Scene.bundled("bathroom"))
+    >>> room = summarize(Scene.bundled("bathroom"))
     >>> by_name([room, dataclasses.replace(room, look_alikes=0.5)])
     [Group(name='bathroom', scenes=2, states=352, look_alikes=0.25, most=0.5)]
     """
@@ -142,3 +143,6 @@ def by_name(found: Sequence[Summary]) -> list[Group]:
         alike = sum(summary.look_alikes * summary.states for summary in mine) / states
         groups.append(Group(name, len(mine), states, alike, max(summary.look_alikes for summary in mine)))
     return groups
+
+
+__getattr__ = moved_names(__name__, {"summarise": "vusfa.sources.summary.summarize"})

@@ -57,7 +57,7 @@ def test_no_furniture_is_one_clear_error(tmp_path: Path) -> None:
 
 def test_materials_fall_back_to_the_only_picture_in_the_models_folder(boxes: Catalogue) -> None:
     found = material_library(boxes.archive(boxes["Boxes#1"]), "boxes/crate/crate.obj")
-    assert found["wood"].colour == [0.5, 0.25, 0.125]
+    assert found["wood"].color == [0.5, 0.25, 0.125]
     assert found["wood"].texture == "boxes/crate/other.png"
     assert (found["glass"].opacity, found["glass"].texture) == (0.2, None)
 

@@ -1,4 +1,4 @@
-"""What can be wrong with a plan, said so that it can be mended."""
+"""Validation of plans."""
 
 from __future__ import annotations
 

@@ -71,12 +71,12 @@ class Frames:
         """
         return exposure_of(self._probes.read()) if self._given is None else self._given
 
-    def render(self, frame: FrameOf, tell: Callable[[], None]) -> None:
+    def render(self, frame: FrameOf, report: Callable[[], None]) -> None:
         """Render what is not there yet.
 
         Args:
             frame: renders one.
-            tell: called after each.
+            report: called after each.
 
         Raises:
             SceneError: the room is dark, or the disk is full.
@@ -89,14 +89,14 @@ class Frames:
 
         for state in self._probed[len(self._probes) :]:
             self._probes.append(linear(state)[None])
-            tell()
+            report()
         exposure = self.exposure
-        known = dict(zip(self._probed, self._probes.read(), strict=True))
+        probes = dict(zip(self._probed, self._probes.read(), strict=True))
         for state in range(len(self._frames), self._room.num_states):
-            picture = known[state] if state in known else linear(state)
+            picture = probes[state] if state in probes else linear(state)
             self._frames.append(tone_map(picture, exposure)[None])
-            if state not in known:
-                tell()
+            if state not in probes:
+                report()
 
     def read(self, first: int, last: int) -> np.ndarray:
         """Pictures (last - first, H, W, 3) uint8."""

@@ -80,8 +80,8 @@ class _Builder:
 
     def surface_of(self, part: Part) -> Any:
         if part.texture is None:
-            key = tuple(float(value) for value in part.colour)
-            if key not in self._plain:  # thousands of parts share a few colours
+            key = tuple(float(value) for value in part.color)
+            if key not in self._plain:  # thousands of parts share a few colors
                 self._plain[key] = self.mi.load_dict(self.diffuse({"type": "rgb", "value": list(key)}))
             return self._plain[key]
         surface = self.diffuse(self.bitmap(part.texture))
@@ -151,12 +151,12 @@ def build_scene(mi: Any, plan: Plan, catalogue: Catalogue) -> Any:
     """
     builder = _Builder(mi)
     _add_shell(builder, plan, draw_textures(plan))
-    known: dict[str, list[Part]] = {}
+    loaded: dict[str, list[Part]] = {}
     things: list[Furniture | Window] = [*plan.furniture, *plan.windows]
     for k, item in enumerate(things):
-        if item.model not in known:
-            known[item.model] = load_parts(catalogue, catalogue[item.model])
-        parts = known[item.model]
+        if item.model not in loaded:
+            loaded[item.model] = load_parts(catalogue, catalogue[item.model])
+        parts = loaded[item.model]
         assert item.size is not None
         assert item.elevation is not None
         placed = place(parts, item.size, item.at, item.elevation, item.facing)

@@ -1,6 +1,6 @@
 """Rooms drawn from a kind and a seed: the same arguments always give the same plan.
 
-Many drafts are drawn and furnished; the one whose number of free places comes nearest to the wanted one, with
+Many drafts are drawn and furnished; the one whose number of free places comes nearest to ``cells``, with
 the fewest places cut off and enough furniture, becomes the plan.
 """
 
@@ -166,7 +166,7 @@ def as_plan(
     draft: Draft, name: str, kind: str, seed: int, surfaces: Surfaces, cells: list[tuple[int, int]]
 ) -> Plan:
     """A finished draft as a plan, lamps put up."""
-    # Not rounded: a wall's number of pixels, and so all colours drawn after it, hang on the last digit.
+    # Not rounded: a wall's number of pixels, and so all colors drawn after it, hang on the last digit.
     solids = tuple(Solid(tuple(float(edge) for edge in rect)) for rect in draft.solids)  # type: ignore[arg-type]
     return Plan(
         name=name,
@@ -188,7 +188,7 @@ def layout(kind: str, seed: int = 1, cells: int | None = None, catalogue: Catalo
     Args:
         kind: bathroom, bedroom, kitchen, living_room or hall.
         seed: any whole number.
-        cells: wanted number of free places, of half a metre; the kind's own when left out. The plan comes as
+        cells: number of free places, of half a metre; the kind's own when left out. The plan comes as
             near as chance has it, mostly within two.
         catalogue: sizes of the models; the package's table when left out.
 
@@ -202,7 +202,7 @@ def layout(kind: str, seed: int = 1, cells: int | None = None, catalogue: Catalo
     catalogue = Catalogue.bundled() if catalogue is None else catalogue
     kind_programme, share = scaled(kind, cells)
     if cells is not None and kind_programme is not programme(kind):
-        # The same furniture takes about the same floor in a larger room: a few drafts tell how much.
+        # The same furniture takes about the same floor in a larger room: a few drafts show how much.
         tried = [_attempt(kind_programme, share, kind, seed, -k, catalogue) for k in range(1, _TRIALS + 1)]
         free = sum(len(draft.cells) + draft.cut_off for draft in tried) / _TRIALS
         places = kind_programme.grid[0] * kind_programme.grid[1]

@@ -37,7 +37,7 @@ class Part:
         vertices: (n, 3).
         faces: (m, 3) indices.
         uv: (n, 2) texture coordinates, or None.
-        colour: (3,) linear red, green, blue, where there is no texture.
+        color: (3,) linear red, green, blue, where there is no texture.
         texture: (h, w, 3) linear, or None.
         opacity: (h, w, 1), where the texture has holes.
     """
@@ -45,16 +45,16 @@ class Part:
     vertices: np.ndarray
     faces: np.ndarray
     uv: np.ndarray | None
-    colour: np.ndarray
+    color: np.ndarray
     texture: np.ndarray | None = None
     opacity: np.ndarray | None = None
 
 
 @dataclass
 class Material:
-    """An entry of a material library: diffuse colour (sRGB), opacity, and the texture's file."""
+    """An entry of a material library: diffuse color (sRGB), opacity, and the texture's file."""
 
-    colour: list[float] | None = None
+    color: list[float] | None = None
     opacity: float = 1.0
     texture: str | None = None
 
@@ -76,7 +76,7 @@ def material_library(archive: Archive, file: str) -> dict[str, Material]:
             if key == "newmtl":
                 current = found[value.strip()] = Material()
             elif key == "Kd":
-                current.colour = [float(number) for number in value.split()[:3]]
+                current.color = [float(number) for number in value.split()[:3]]
             elif key == "d":
                 current.opacity = float(value.split()[-1])
             elif key == "map_Kd":
@@ -108,7 +108,7 @@ class _Files(Mapping[str, bytes]):
 
 
 def _texture(image: Image.Image) -> tuple[np.ndarray, np.ndarray | None]:
-    """Linear colours (h, w, 3) and, where the picture has holes, the opacity (h, w, 1)."""
+    """Linear colors (h, w, 3) and, where the picture has holes, the opacity (h, w, 1)."""
     pixels = np.asarray(image.convert("RGBA"), np.float32) / 255
     step = max(1, max(pixels.shape[:2]) // _LARGEST_TEXTURE)
     pixels = pixels[::step, ::step]
@@ -169,16 +169,16 @@ def _parts(geometry: Any, library: dict[str, Material], archive: Archive, model:
         if uv is not None:
             uv = np.where(np.isfinite(uv) & (np.abs(uv) < _ABSURD), uv, 0)
         diffuse = getattr(getattr(mesh.visual, "material", None), "diffuse", [180, 180, 180, 255])
-        colour = np.array(entry.colour) if entry.colour else np.array(diffuse, float)[:3] / 255
+        color = np.array(entry.color) if entry.color else np.array(diffuse, float)[:3] / 255
         texture, opacity = _texture(image) if image is not None else (None, None)
         if entry.opacity < _GLASS:  # it still counts for the model's extent
-            yield Part(vertices, np.empty((0, 3), np.uint32), None, colour)
+            yield Part(vertices, np.empty((0, 3), np.uint32), None, color)
             continue
         yield Part(
             vertices,
             np.asarray(mesh.faces, np.uint32),
             uv,
-            np.clip(colour**2.2 * 0.9, 0.01, 0.85),
+            np.clip(color**2.2 * 0.9, 0.01, 0.85),
             texture,
             opacity,
         )

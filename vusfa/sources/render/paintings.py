@@ -1,4 +1,4 @@
-"""Pictures for walls and views for windows: landscapes, blocks, discs, cells, clouds of colour, rays."""
+"""Pictures for walls and views for windows: landscapes, blocks, discs, cells, clouds of color, rays."""
 
 from __future__ import annotations
 
@@ -36,8 +36,8 @@ def _blocks(u: np.ndarray, v: np.ndarray, ratio: float, hue: float, rng: np.rand
     for x0, x1 in zip([0, *columns], [*columns, 1], strict=True):
         for y0, y1 in zip([0, *rows], [*rows, 1], strict=True):
             if rng.random_sample() < 0.6:
-                colour = from_hsv(rng.random_sample(), rng.uniform(0.4, 0.9), rng.uniform(0.5, 0.95))
-                image[(u >= x0) & (u < x1) & (v >= y0) & (v < y1)] = colour
+                color = from_hsv(rng.random_sample(), rng.uniform(0.4, 0.9), rng.uniform(0.5, 0.95))
+                image[(u >= x0) & (u < x1) & (v >= y0) & (v < y1)] = color
     for edge in columns:
         image[np.abs(u - edge) < 0.015] = 0.06
     for edge in rows:
@@ -48,21 +48,21 @@ def _blocks(u: np.ndarray, v: np.ndarray, ratio: float, hue: float, rng: np.rand
 def _discs(u: np.ndarray, v: np.ndarray, ratio: float, hue: float, rng: np.random.RandomState) -> np.ndarray:
     image = np.ones((*u.shape, 3)) * from_hsv(hue, 0.25, 0.9)
     for _ in range(rng.randint(4, 12)):
-        colour = from_hsv(rng.random_sample(), 0.7, rng.uniform(0.3, 0.95))
+        color = from_hsv(rng.random_sample(), 0.7, rng.uniform(0.3, 0.95))
         x, y = rng.random_sample(), rng.random_sample()
-        image[(u - x) ** 2 / ratio + (v - y) ** 2 * ratio < rng.uniform(0.002, 0.04)] = colour
+        image[(u - x) ** 2 / ratio + (v - y) ** 2 * ratio < rng.uniform(0.002, 0.04)] = color
     return image
 
 
 def _cells(u: np.ndarray, v: np.ndarray, ratio: float, hue: float, rng: np.random.RandomState) -> np.ndarray:
-    centres = rng.random_sample((18, 2))
-    colours = np.stack(
+    centers = rng.random_sample((18, 2))
+    colors = np.stack(
         [
             from_hsv(hue + rng.uniform(-0.2, 0.2), rng.uniform(0.2, 0.9), rng.uniform(0.3, 1))
             for _ in range(18)
         ]
     )
-    return colours[np.argmin([(u - x) ** 2 + (v - y) ** 2 for x, y in centres], axis=0)]
+    return colors[np.argmin([(u - x) ** 2 + (v - y) ** 2 for x, y in centers], axis=0)]
 
 
 def _clouds(u: np.ndarray, v: np.ndarray, ratio: float, hue: float, rng: np.random.RandomState) -> np.ndarray:
@@ -87,7 +87,7 @@ def _canvas(width: float, height: float) -> tuple[np.ndarray, np.ndarray]:
 
 
 def painting(seed: int, width: float, height: float) -> np.ndarray:
-    """A framed picture; the seed draws its style, its colours and its frame.
+    """A framed picture; the seed draws its style, its colors and its frame.
 
     Args:
         seed: any whole number.
@@ -106,11 +106,11 @@ def painting(seed: int, width: float, height: float) -> np.ndarray:
     image = np.clip(style(u, v, height / width, rng.random_sample(), rng), 0.03, 0.97)
     edge = max(3, int(_FRAME * _PIXELS))
     if rng.random_sample() < 0.7:
-        colour = from_hsv(rng.uniform(0.05, 0.12), 0.6, rng.uniform(0.15, 0.7))
+        color = from_hsv(rng.uniform(0.05, 0.12), 0.6, rng.uniform(0.15, 0.7))
     else:
-        colour = np.ones(3) * rng.choice([0.05, 0.9])
-    image[:edge] = image[-edge:] = colour
-    image[:, :edge] = image[:, -edge:] = colour
+        color = np.ones(3) * rng.choice([0.05, 0.9])
+    image[:edge] = image[-edge:] = color
+    image[:, :edge] = image[:, -edge:] = color
     return image.astype(np.float32)
 
 

@@ -58,7 +58,7 @@ class Surfaces:
 
     Args:
         floor: wood, tile or check.
-        seed: draws the colours and the grain, and the walls' patterns where none are named; also which
+        seed: draws the colors and the grain, and the walls' patterns where none are named; also which
             frames the exposure is measured from.
         walls: patterns, one after the other for :meth:`Plan.walls`, from the start again when they run out:
             stripe, wainscot, brick, plain, dots, tile, chevron, plank, diamond.
@@ -217,9 +217,9 @@ class Plan:
     @property
     def is_complete(self) -> bool:
         """Whether all furniture and windows have sizes and elevations."""
-        given = [(item.size, item.elevation) for item in self.furniture]
-        given += [(item.size, item.elevation) for item in self.windows]
-        return not any(None in pair for pair in given)
+        pairs = [(item.size, item.elevation) for item in self.furniture]
+        pairs += [(item.size, item.elevation) for item in self.windows]
+        return not any(None in pair for pair in pairs)
 
     def completed(self, catalogue: Catalogue) -> Plan:
         """A copy whose furniture and windows have all sizes and elevations.

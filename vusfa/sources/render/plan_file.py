@@ -70,26 +70,26 @@ def _build(kind: Any, value: Any, where: str, faults: list[str]) -> Any:
     """``value`` as the type ``kind``; what does not fit becomes a line in ``faults`` and None."""
     origin = get_origin(kind)
     if origin in (Union, types.UnionType):
-        wanted = next(option for option in get_args(kind) if option is not type(None))
-        return None if value is None else _build(wanted, value, where, faults)
+        inner = next(option for option in get_args(kind) if option is not type(None))
+        return None if value is None else _build(inner, value, where, faults)
     if dataclasses.is_dataclass(kind):
         return _build_entry(kind, value, where, faults)
     if origin is tuple:
-        wanted = get_args(kind)
+        parts = get_args(kind)
         if not isinstance(value, list):
             faults.append(f"{where}: {brief(value)} must be a list")
             return None
         if len(value) > MAX_FURNITURE:
             faults.append(f"{where}: has {len(value)} entries; at most {MAX_FURNITURE} are read")
             return None
-        if wanted[-1] is Ellipsis:
-            return tuple(_build(wanted[0], item, f"{where}[{k}]", faults) for k, item in enumerate(value))
-        if len(value) != len(wanted):
-            faults.append(f"{where}: {brief(value)} must have {len(wanted)} entries")
+        if parts[-1] is Ellipsis:
+            return tuple(_build(parts[0], item, f"{where}[{k}]", faults) for k, item in enumerate(value))
+        if len(value) != len(parts):
+            faults.append(f"{where}: {brief(value)} must have {len(parts)} entries")
             return None
         return tuple(
             _build(part, item, f"{where}[{k}]", faults)
-            for k, (part, item) in enumerate(zip(wanted, value, strict=True))
+            for k, (part, item) in enumerate(zip(parts, value, strict=True))
         )
     fits = {
         float: _is_number,
@@ -118,7 +118,7 @@ def _build_entry(kind: Any, value: Any, where: str, faults: list[str]) -> Any:
     for key in value:
         if key not in fields:
             faults.append(f"{prefix}{key}: there is no such key; the keys are {', '.join(fields)}")
-    given = {
+    values = {
         key: _build(hints[key], item, f"{prefix}{key}", faults)
         for key, item in value.items()
         if key in fields
@@ -127,7 +127,7 @@ def _build_entry(kind: Any, value: Any, where: str, faults: list[str]) -> Any:
         required = field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING
         if required and name not in value:
             faults.append(f"{prefix}{name}: is missing")
-    return kind(**given) if len(faults) == before else None
+    return kind(**values) if len(faults) == before else None
 
 
 def from_yaml(text: str, source: str = "plan") -> Plan:

@@ -100,8 +100,8 @@ class Renderer:
         layers = np.array(
             self._integrator.render(self._scene, self._sensor, seed=seed, spp=samples, evaluate=False)
         )
-        colour, normal, albedo = (
+        color, normal, albedo = (
             np.ascontiguousarray(layer, np.float32)
             for layer in (layers[..., :3], layers[..., -6:-3], np.clip(layers[..., -3:], 0, 1))
         )
-        return np.array(mitsuba_oidn.denoise(colour, albedo=albedo, normal=normal, hdr=True))
+        return np.array(mitsuba_oidn.denoise(color, albedo=albedo, normal=normal, hdr=True))

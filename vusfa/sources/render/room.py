@@ -1,4 +1,4 @@
-"""From a plan to a scene file: frames, features, graph, and whom to thank for the furniture.
+"""Rendering of a plan into a scene file: frames, features, graph, credits for the furniture.
 
 The work can be stopped at any moment and started again: finished frames and features lie beside the
 product, in hidden files that are removed when it is written.
@@ -39,7 +39,7 @@ Progress = Callable[[str, int, int], None]
 
 @dataclass(frozen=True)
 class Rendered:
-    """What came of rendering a room.
+    """Result of rendering a room.
 
     Args:
         path: the scene file.
@@ -119,13 +119,13 @@ def render_room(
     Args:
         plan: the room.
         out: scene file to write.
-        progress: told about frames, then features.
+        progress: called with frames, then with features.
         catalogue: furniture with its files; that of this machine when left out.
         backbone: makes the features: a name for :func:`vusfa.sources.backbones.load_backbone`, or a network.
         backend: Mitsuba's variant; the fastest that works when left out.
         threads: how many threads render, on which pictures do not depend; when left out one for each core,
             and one without LLVM.
-        say: told in a line which variant is used.
+        say: called with a line that names the variant.
 
     Raises:
         SceneError: the plan has faults, furniture or packages are missing, or the file cannot be written.

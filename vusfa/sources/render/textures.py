@@ -37,7 +37,7 @@ def random_stream(seed: int) -> np.random.RandomState:
 
 
 def from_hsv(hue: float, saturation: float, value: float) -> np.ndarray:
-    """A colour (3,) from hue (any number, taken modulo 1), saturation and value.
+    """A color (3,) from hue (any number, taken modulo 1), saturation and value.
 
     >>> from_hsv(1.0, 1.0, 0.5).tolist()
     [0.5, 0.0, 0.0]
@@ -60,7 +60,7 @@ def _brick_shift(y: np.ndarray) -> np.ndarray:
     return 0.5 * (np.floor(y / _BRICK[1]) % 2)
 
 
-# Where a wall has its second colour: x from the left, y from the top, period p, the wall's height h.
+# Where a wall has its second color: x from the left, y from the top, period p, the wall's height h.
 _MASKS: dict[str, Callable[[np.ndarray, np.ndarray, float, float], np.ndarray]] = {
     "stripe": lambda x, y, p, h: (x / p) % 1 < 0.45,
     "dots": lambda x, y, p, h: (
@@ -93,10 +93,10 @@ def wall(pattern: str, hue: float, length: float, height: float, rng: np.random.
 
     Args:
         pattern: one of :data:`WALLS`.
-        hue: of its first colour.
+        hue: of its first color.
         length: metres.
         height: metres.
-        rng: draws the shades, the second colour, the pattern's period and the blotches.
+        rng: draws the shades, the second color, the pattern's period and the blotches.
 
     Returns:
         (130 * height, 130 * length, 3) float32.
@@ -124,13 +124,13 @@ def wall(pattern: str, hue: float, length: float, height: float, rng: np.random.
 
 
 def _boards(x: np.ndarray, y: np.ndarray, rng: np.random.RandomState) -> np.ndarray:
-    colour = from_hsv(rng.uniform(0.06, 0.1), rng.uniform(0.4, 0.6), rng.uniform(0.5, 0.72))
+    color = from_hsv(rng.uniform(0.06, 0.1), rng.uniform(0.4, 0.6), rng.uniform(0.5, 0.72))
     board = np.floor(x / 0.13).astype(int)
     piece = np.floor(y / 1.1 + (board * 0.37) % 1).astype(int)
     tone = rng.uniform(0.72, 1.12, (piece.max() + 1, board.max() + 1))[piece, board]
     grain = 0.06 * np.sin(x * 190 + 3 * blotches(rng, x.shape[0], x.shape[1], 60)[..., 0] * 3)
     joint = np.where((x / 0.13) % 1 < 0.05, 0.6, 1)
-    return colour * (tone + grain)[..., None] * joint[..., None]
+    return color * (tone + grain)[..., None] * joint[..., None]
 
 
 def _slabs(pattern: str, x: np.ndarray, y: np.ndarray, rng: np.random.RandomState) -> np.ndarray:
@@ -151,7 +151,7 @@ def floor(pattern: str, width: float, depth: float, rng: np.random.RandomState) 
         pattern: one of :data:`FLOORS`.
         width: metres, along the array's second axis.
         depth: metres.
-        rng: draws colours, boards or slabs, and blotches.
+        rng: draws colors, boards or slabs, and blotches.
 
     Returns:
         (100 * depth, 100 * width, 3) float32.
