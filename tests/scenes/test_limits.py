@@ -16,7 +16,7 @@ from PIL import Image
 
 from vusfa.errors import SceneError
 from vusfa.scenes import Scene, validate
-from vusfa.scenes.pictures import decode
+from vusfa.scenes.pictures import decode, read_jpegs
 
 Make = Callable[..., Path]
 
@@ -132,3 +132,17 @@ def test_only_regular_files_are_opened(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe.h5")
     for path in (tmp_path / "pipe.h5", Path("/dev/zero")):
         assert validate(path) == [f"{path}: is no regular file; check the path"]
+
+
+def test_one_picture_for_many_states_is_not_multiplied(
+    make_file: Make, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Entries of one dataset can share their bytes in the file, and would not share them in memory."""
+    path = make_file()
+    with h5py.File(path, "a") as file:
+        dataset = file.create_dataset("observation_jpeg", (5,), h5py.vlen_dtype(np.uint8))
+        for state in range(5):
+            dataset[state] = np.zeros(10_000, np.uint8)
+    monkeypatch.setattr(Path, "stat", lambda self: os.stat_result([0o100644, 0, 0, 0, 0, 0, 20_000, 0, 0, 0]))
+    with pytest.raises(SceneError, match="has more bytes than the file"):
+        read_jpegs(path)

@@ -182,7 +182,14 @@ def read_jpegs(path: Path) -> list[bytes] | None:
         found = _find(file)
         if found is None or found[0] != _JPEG:
             return None
-        return [jpeg.tobytes() for jpeg in found[1][()]]
+        jpegs: list[bytes] = []
+        left = path.stat().st_size
+        for first in range(0, len(found[1]), _AT_ONCE):
+            jpegs += [jpeg.tobytes() for jpeg in found[1][first : first + _AT_ONCE]]
+            left -= sum(map(len, jpegs[first:]))
+            if left < 0:
+                raise SceneError(f"{path}: dataset {_JPEG!r} has more bytes than the file; write it again")
+        return jpegs
 
 
 def write_jpegs(file: h5py.File, jpegs: Sequence[bytes]) -> None:
