@@ -1,6 +1,6 @@
-"""A complete update in plain PyTorch: collect, returns, loss, backward, optimiser. One page, no library.
+"""A complete update in plain PyTorch: collect, returns, loss, backward, optimizer. One page, no library.
 
-The same losses, targets, coefficients, optimiser and numbers of environments and steps as a
+The same losses, targets, coefficients, optimizer and numbers of environments and steps as a
 :class:`vusfa.training.Trainer`, whose weights it begins with; ``tests/benchmarks/test_bare_update.py``
 compares loss terms and gradients with :class:`vusfa.objectives.USFLoss`. Weights stand still between
 collecting and stepping, so the table of encoded states is computed once for both. It counts no episodes and
@@ -89,7 +89,7 @@ class BareTraining:
             step_reward=env["step_reward"],
         )
         self.beta = torch.tensor(float(self.objective["bottleneck_coeff"]))
-        self.optimiser = torch.optim.Adam(
+        self.optimizer = torch.optim.Adam(
             self.params, lr=self.optim["lr"], **{"fused": True, **self.optim["options"]}
         )
         self.frames = 0
@@ -123,12 +123,12 @@ class BareTraining:
         states, goals = self.net.states(w), self.net.goals(w, self.goal_ids)
         batch = self._walk(w, states.detach(), _detached(goals))
         loss, kl = self.loss(w, states, goals, batch)
-        for group_ in self.optimiser.param_groups:
+        for group_ in self.optimizer.param_groups:
             group_["lr"] = self._annealed(self.optim["lr"], 0.0, self.optim["horizon"])
-        self.optimiser.zero_grad()
+        self.optimizer.zero_grad()
         loss.backward()
         torch.nn.utils.clip_grad_norm_(self.params, self.optim["max_grad_norm"])
-        self.optimiser.step()
+        self.optimizer.step()
         if kl is not None:
             step, target = self.objective["bottleneck_step_size"], self.objective["information_target"]
             self.beta = (self.beta + step * (kl.detach() - target)).clamp(min=0.0)

@@ -127,7 +127,7 @@ def test_the_numbers_of_controlled(settings):
 
 @pytest.mark.parametrize("preset", ["controlled", "paper", "reference"])
 @pytest.mark.parametrize("optim", ["adam", "rmsprop", "tf_rmsprop"])
-def test_a_chosen_optimiser_comes_with_its_numbers(settings, preset: str, optim: str):
+def test_a_chosen_optimizer_comes_with_its_numbers(settings, preset: str, optim: str):
     cfg = settings(f"preset={preset}", f"optim={optim}", "total_frames=5000")
     written = OmegaConf.load(CONF / "optim" / f"{optim}.yaml")
     assert cfg.optim == OmegaConf.merge({"total_frames": 5000, "optim": written}).optim
