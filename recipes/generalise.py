@@ -1,131 +1,13 @@
 """Rooms never seen: python recipes/generalise.py rooms/small
 
-Trains one agent, with heads that are the same for all rooms, on most of a folder of dumps, and sends it to
-every goal of the others, as it is and with a memory of the episode. Beside it the random walk, computed, and
-the same memory around a policy that knows nothing. Results go to results/generalise/NAME-SEED; the table
-with intervals is of all seeds that are there.
+Trains one agent in most of a folder of rooms, and sends it to every goal of the others. The same as ``vusfa
+generalise``; read vusfa/experiments/generalise.py.
 """
 
 from __future__ import annotations
 
-import re
-import sys
-from pathlib import Path
-from typing import Any
-
-import torch
-import tyro
-from omegaconf import OmegaConf
-
-from vusfa.cli.launch import compose
-from vusfa.errors import SceneError, VusfaError
-from vusfa.evaluation import Episodes, evaluate, print_summary, random_walk_summary, summary
-from vusfa.evaluation.exact import exact_goals, uniform_probabilities
-from vusfa.experiments.generalise import unseen_table
-from vusfa.experiments.runs import Run, read_runs, write_run
-from vusfa.modules import ActingPolicy, TriedActions, transplant
-from vusfa.scenes import SceneSet
-from vusfa.training import EvaluationProgress, load_agent, run_facts
-
-sys.path.insert(0, str(Path(__file__).parent))
-from train import train
-
-from vusfa.conf import FOLDER as CONF
-
-
-def split_rooms(folder: Path, trained: int, tested: int) -> tuple[list[str], list[str]]:
-    """Dumps to train on and to test in: in the order of the numbers that their names end in, the first and
-    the last.
-
-    Raises:
-        SceneError: there are fewer.
-    """
-    number = re.compile(r"(\d+)$")
-    files = sorted(
-        folder.glob("*.h5"),
-        key=lambda path: (int(found[0]) if (found := number.search(path.stem)) else 0, path.stem),
-    )
-    if len(files) < trained + tested:
-        raise SceneError(
-            f"{folder}: {len(files)} dumps (.h5), {trained + tested} are wanted; render some with"
-            " 'vusfa scenes render', or ask for fewer"
-        )
-    return [str(path) for path in files[:trained]], [str(path) for path in files[-tested:]]
-
-
-def policies(agent: Any, scenes: SceneSet, weight: float, temperature: float) -> dict[str, Any]:
-    """Who walks in the rooms, by name."""
-    sizes = scenes.num_states, scenes.num_actions
-    return {
-        "agent": ActingPolicy(agent),
-        "agent-memory": TriedActions(agent, *sizes, weight=weight, temperature=temperature),
-        "memory": TriedActions(None, *sizes, weight=weight),
-    }
-
-
-def generalise(
-    rooms: Path,
-    overrides: tyro.conf.Positional[list[str]] = [],  # noqa: B006
-    /,
-    *,
-    name: str = "vusfa",
-    seed: int = 0,
-    trained: int = 32,
-    tested: int = 8,
-    weight: float = 3.0,
-    temperature: float = 1.0,
-    episodes: int = 10,
-    results: Path = Path("results"),
-    runs: Path = Path("runs"),
-) -> None:
-    """Train on some rooms, test in others.
-
-    Args:
-        rooms: folder of dumps (.h5).
-        overrides: settings of recipes/train.py over those of preset=unseen.
-        name: of the cell, before its seed.
-        seed: of everything.
-        trained: rooms to train on.
-        tested: rooms to test in.
-        weight: of the memory: off the logits for each time that an action was tried here.
-        temperature: of the agent's logits, beside the memory.
-        episodes: to every goal of the rooms to test in.
-        results: where the cell is written.
-        runs: where the checkpoint is kept.
-    """
-    first, last = split_rooms(rooms, trained, tested)
-    unseen, folder = SceneSet.open(last), runs / "generalise" / f"{name}-{seed}"
-    settings = ["preset=unseen", *overrides, f"seed={seed}", f"scenes=[{','.join(first)}]"]
-    cfg = compose(CONF, "train", [*settings, f"folder={folder}", "evaluation=none"])
-    OmegaConf.resolve(cfg)
-    if not (folder / "checkpoint.pt").exists() and (code := train(cfg, settings)[2]):
-        sys.exit(code)
-    agent, _, state = load_agent(folder / "checkpoint.pt")
-    tables: dict[str, Episodes] = {}
-    with EvaluationProgress() as progress:
-        for who, policy in policies(transplant(agent, unseen).eval(), unseen, weight, temperature).items():
-            tables[who] = evaluate(
-                policy,
-                unseen,
-                episodes_per_goal=episodes,
-                history=agent.config["history"],
-                seed=seed,
-                batch_size=1024,
-                progress=lambda done, total, who=who: progress(who, done, total),  # type: ignore[misc]
-            )
-    facts = {**run_facts(state, overrides), "trained_in": [Path(p).stem for p in first]}
-    info = {**facts, "memory_weight": weight, "temperature": temperature, "tested_in": list(unseen.names)}
-    walk = exact_goals(uniform_probabilities(unseen.num_actions), unseen)
-    print(write_run(results, Run("generalise", f"{name}-{seed}", info, tables, walk)))
-    rows = [row for who, table in tables.items() for row in summary(table, who)]
-    none, every = torch.tensor([], dtype=torch.int64), torch.arange(unseen.num_states)
-    print_summary([*rows, *random_walk_summary(unseen, every, none)])
-    print(unseen_table([run for run in read_runs(results, "generalise") if run.name.startswith(f"{name}-")]))
-
+from vusfa.cli.functions import run_functions
+from vusfa.experiments.generalise import generalise
 
 if __name__ == "__main__":
-    torch.set_num_threads(1)
-    try:
-        tyro.cli(generalise)
-    except VusfaError as error:
-        sys.exit(f"error: {error}")
+    run_functions(generalise)

@@ -13,12 +13,11 @@ from vusfa.evaluation import Episodes
 from vusfa.evaluation.exact import ExactGoals
 from vusfa.evaluation.statistics import Estimate
 from vusfa.experiments.experiment import Experiment, read_experiment
+from vusfa.experiments.markdown import flat_rows, markdown
 from vusfa.experiments.runs import Run, write_run
 from vusfa.experiments.tables import (
     comparison_rows,
     distance_rows,
-    flat_rows,
-    markdown,
     middle_rows,
     model_rows,
     run_rows,

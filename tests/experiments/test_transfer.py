@@ -83,7 +83,7 @@ def test_the_table_by_hand() -> None:
     lines = transfer_table(cells, threshold=55).splitlines()
     assert len(lines) == 4
     row = [part.strip() for part in lines[2].split("|")[1:-1]]
-    assert row[:4] == ["1-step", "gvf", "trained on", "2"]
+    assert row[:4] == ["1-step", "gvf", "fine-tuned", "2"]
     assert row[4].split(" ")[0] == f"{(52.5 + 60 + 67.5 + 75) / 4:.1f}"
     assert row[5] == "100.0 [100.0, 100.0]"
     assert row[6].split(" ")[0] == "25.0"

@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 
 from vusfa.errors import SceneError
+from vusfa.experiments.generalise import split_rooms
 from vusfa.experiments.runs import read_run
 from vusfa.scenes import Scene
 
@@ -32,11 +33,11 @@ def rooms(make_scene: Callable[..., Scene], tmp_path: Path) -> Path:
 
 
 def test_the_last_numbers_are_tested(recipe: Callable[[str], Any], rooms: Path) -> None:
-    first, last = recipe("generalise").split_rooms(rooms, 2, 1)
+    first, last = split_rooms(rooms, 2, 1)
     assert [Path(path).stem for path in first] == ["hall-1", "attic-2"]
     assert [Path(path).stem for path in last] == ["hall-10"]
     with pytest.raises(SceneError, match=r"4 dumps \(\.h5\), 5 are wanted"):
-        recipe("generalise").split_rooms(rooms, 4, 1)
+        split_rooms(rooms, 4, 1)
 
 
 def test_trained_in_some_rooms_and_tested_in_others(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -28,8 +28,8 @@ SMALL = [
 
 
 @pytest.fixture
-def table1(recipe: Callable[[str], Any]) -> Any:
-    return recipe("table1")
+def table1() -> Any:
+    return import_module("vusfa.experiments.table1")
 
 
 @pytest.fixture

@@ -29,6 +29,35 @@ COMMANDS = [
 TRAINING_COMMANDS = ["vusfa.cli.train"]
 
 
+#: Commands beside ``vusfa scenes``: name, help, and the functions that they run.
+FUNCTIONS: dict[str, tuple[str, dict[str, str]]] = {
+    "evaluate": (
+        "Evaluate a checkpoint: every state of every scene a goal.",
+        {"": "vusfa.experiments.zero_shot.zero_shot"},
+    ),
+    "table1": (
+        "The paper's Table 1: train and evaluate, per model and seed.",
+        {"": "vusfa.experiments.table1.table1"},
+    ),
+    "tables": (
+        "All tables of results, with intervals; Markdown and CSV.",
+        {"": "vusfa.experiments.print_tables.print_tables"},
+    ),
+    "transfer": (
+        "The paper's Figure 2: run the fine-tuning towards new goals, show its figure.",
+        {
+            "run": "vusfa.experiments.run_transfer.run_transfer",
+            "show": "vusfa.report.transfer_figure.show_transfer",
+        },
+    ),
+    "generalise": (
+        "Train in some rooms, test in others.",
+        {"": "vusfa.experiments.generalise.generalise"},
+    ),
+    "report": ("One HTML page of runs and results.", {"": "vusfa.report.command.report_runs"}),
+}
+
+
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run the command line and end the process.
 

@@ -9,7 +9,8 @@ import typer
 from typer.core import TyperGroup
 
 from vusfa import __version__
-from vusfa.cli import COMMANDS, TRAINING_COMMANDS
+from vusfa.cli import COMMANDS, FUNCTIONS, TRAINING_COMMANDS
+from vusfa.cli.functions import forward
 from vusfa.errors import VusfaError
 
 __all__ = ["app", "scenes"]
@@ -61,5 +62,7 @@ def _vusfa(
 
 for _name in TRAINING_COMMANDS:
     import_module(_name).register(app)
+for _name, (_words, _functions) in FUNCTIONS.items():
+    forward(app, _name, _words, _functions)
 for _name in COMMANDS:
     import_module(_name).register(scenes)

@@ -7,7 +7,8 @@ from vusfa.evaluation.baselines import random_walk, shortest_paths
 from vusfa.evaluation.comparison import Comparison, check_comparison, compare
 from vusfa.evaluation.episodes import Episodes
 from vusfa.evaluation.metrics import METRICS, Metric, get_metric, register_metric
-from vusfa.evaluation.navigation import episode_starts, evaluate, trails, walk
+from vusfa.evaluation.navigation import evaluate, trails, walk
+from vusfa.evaluation.starts import episode_starts
 from vusfa.evaluation.summary import print_summary, random_walk_summary, summary
 
 __all__ = [

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from vusfa.evaluation.episodes import Episodes
-from vusfa.evaluation.navigation import Unreachable
+from vusfa.evaluation.starts import Unreachable
 from vusfa.scenes import Scene
 from vusfa.scenes.markov import random_walk_success
 

@@ -15,7 +15,8 @@ from vusfa.envs.goals import resolve_goals
 from vusfa.errors import ConfigError, GoalError
 from vusfa.evaluation.baselines import SHORTEST_PATH, shortest_paths
 from vusfa.evaluation.episodes import Episodes
-from vusfa.evaluation.navigation import Unreachable, episode_starts, evaluate
+from vusfa.evaluation.navigation import evaluate
+from vusfa.evaluation.starts import Unreachable, episode_starts
 from vusfa.evaluation.summary import count_pairs, random_walk_summary, summary
 from vusfa.files import write_csv, write_json
 from vusfa.scenes import SceneSet

@@ -19,7 +19,7 @@ from vusfa.evaluation.baselines import RANDOM_WALK, random_walk
 from vusfa.evaluation.episodes import Episodes
 from vusfa.evaluation.exact import ExactGoals
 from vusfa.evaluation.metrics import metrics_within
-from vusfa.evaluation.navigation import Unreachable
+from vusfa.evaluation.starts import Unreachable
 from vusfa.evaluation.statistics import Sums
 from vusfa.scenes import SceneSet
 

@@ -1,19 +1,17 @@
-"""How sure a number is: bootstrap intervals over seeds and goals, interquartile means, probability of
-improvement. Pure functions of tables of sums.
+"""Bootstrap intervals over seeds and goals, interquartile means, probability of improvement.
 
 A result is a table of numbers per seed and goal, (K, G). Both are samples, of trainings and of goals, so both
 are drawn again, each with replacement: the crossed, or pigeonhole, bootstrap (Owen 2007, "The pigeonhole
 bootstrap", Annals of Applied Statistics 1(2), sec. 2). Goals are drawn within their scenes, which are given.
-Intervals are percentiles of what the resamples give. With the same seed of the draws and tables of the same
-shape all models are drawn alike, and a difference is one of pairs.
+Intervals are percentiles of the resamples. With the same seed and tables of the same shape all models are
+drawn alike, and a difference is one of pairs.
 
 The interquartile mean and the probability of improvement are those of Agarwal et al. 2021, "Deep
 Reinforcement Learning at the Edge of the Statistical Precipice" (arXiv 2108.13264, sec. 4): over seeds and
 scenes, with the seeds drawn again within each scene.
 
-Few seeds are few: a bootstrap over five of them gives intervals that are somewhat too narrow. One seed cannot
-be drawn again at all: its interval tells of the goals alone, and where seeds alone are drawn there is none
-(NaN).
+A bootstrap over five seeds gives intervals that are somewhat too narrow. The interval of one seed is over the
+goals alone; where seeds alone are drawn again, there is none (NaN).
 """
 
 from __future__ import annotations
@@ -44,7 +42,7 @@ __all__ = [
 
 
 class Estimate(NamedTuple):
-    """A number and the interval that it may lie in."""
+    """A number with its interval."""
 
     value: float
     low: float
@@ -90,7 +88,7 @@ def interval(value: float, draws: Tensor, level: float = 0.95) -> Estimate:
 
 
 def resample_counts(groups: Tensor, resamples: int, generator: torch.Generator) -> Tensor:
-    """How often each item is drawn when every group is drawn again from itself, with replacement.
+    """Counts of each item when every group is drawn again from itself, with replacement.
 
     Args:
         groups: (n,) int64, the group of each item.
@@ -229,9 +227,7 @@ def bootstrap_iqm(scores: Tensor, *, level: float = 0.95, resamples: int = 2000,
 
     Args:
         scores: (K, T), of K seeds in T scenes.
-        level: of the interval.
-        resamples: R.
-        seed: of the draws.
+        level, resamples, seed: of the interval and its draws.
 
     >>> bootstrap_iqm(torch.tensor([[0.5, 0.25], [0.5, 0.25]])).value
     0.375
@@ -244,7 +240,7 @@ def bootstrap_iqm(scores: Tensor, *, level: float = 0.95, resamples: int = 2000,
 
 
 def improvement(first: Tensor, second: Tensor) -> Tensor:
-    """The chance that a run of the first does better than one of the second, a tie being half: the
+    """Probability that a run of the first does better than one of the second, a tie being half: the
     Mann-Whitney statistic, averaged over scenes (Agarwal et al. 2021, sec. 4.3).
 
     Args:
@@ -269,9 +265,7 @@ def bootstrap_improvement(
     Args:
         first: (K, T).
         second: (L, T), the same scenes.
-        level: of the interval.
-        resamples: R.
-        seed: of the draws.
+        level, resamples, seed: of the interval and its draws.
 
     >>> bootstrap_improvement(torch.tensor([[2.0], [3.0]]), torch.tensor([[0.0], [1.0]]))
     Estimate(value=1.0, low=1.0, high=1.0)

@@ -20,7 +20,7 @@ from vusfa.evaluation.long_table import (
     select_goals,
 )
 from vusfa.evaluation.metrics import METRICS, get_metric
-from vusfa.evaluation.navigation import Unreachable
+from vusfa.evaluation.starts import Unreachable
 from vusfa.scenes import Scene, SceneSet
 
 if TYPE_CHECKING:

@@ -1,20 +1,125 @@
-"""The table of recipes/generalise.py, from its results alone."""
+"""Rooms never seen: training in some rooms, tests in others, and the table of it: ``vusfa generalise``."""
 
 from __future__ import annotations
 
+import re
+import sys
 from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
 
 import pandas as pd
+import torch
 from torch import Tensor
 
-from vusfa.errors import ResultError
+from vusfa.errors import ResultError, SceneError
+from vusfa.evaluation import Episodes, evaluate, print_summary, random_walk_summary, summary
 from vusfa.evaluation.baselines import RANDOM_WALK
+from vusfa.evaluation.exact import exact_goals, uniform_probabilities
 from vusfa.evaluation.long_table import goal_sums
 from vusfa.evaluation.statistics import Sums, bootstrap_mean, paired_difference
-from vusfa.experiments.runs import Run
-from vusfa.experiments.tables import COMPARED, markdown
+from vusfa.experiments.markdown import markdown
+from vusfa.experiments.runs import Run, read_runs, write_run
+from vusfa.experiments.tables import COMPARED
+from vusfa.experiments.training import compose_settings, train
+from vusfa.modules import ActingPolicy, TriedActions, transplant
+from vusfa.scenes import SceneSet
+from vusfa.training import EvaluationProgress, load_agent, run_facts
 
-__all__ = ["unseen_table"]
+__all__ = ["generalise", "policies", "split_rooms", "unseen_table"]
+
+
+def split_rooms(folder: Path, trained: int, tested: int) -> tuple[list[str], list[str]]:
+    """Dumps to train on and to test in: in the order of the numbers that their names end in, the first and
+    the last.
+
+    Raises:
+        SceneError: there are fewer.
+    """
+    number = re.compile(r"(\d+)$")
+    files = sorted(
+        folder.glob("*.h5"),
+        key=lambda path: (int(found[0]) if (found := number.search(path.stem)) else 0, path.stem),
+    )
+    if len(files) < trained + tested:
+        raise SceneError(
+            f"{folder}: {len(files)} dumps (.h5), {trained + tested} are wanted; render some with"
+            " 'vusfa scenes render', or ask for fewer"
+        )
+    return [str(path) for path in files[:trained]], [str(path) for path in files[-tested:]]
+
+
+def policies(agent: Any, scenes: SceneSet, weight: float, temperature: float) -> dict[str, Any]:
+    """Who walks in the rooms, by name."""
+    sizes = scenes.num_states, scenes.num_actions
+    return {
+        "agent": ActingPolicy(agent),
+        "agent-memory": TriedActions(agent, *sizes, weight=weight, temperature=temperature),
+        "memory": TriedActions(None, *sizes, weight=weight),
+    }
+
+
+def generalise(
+    rooms: Path,
+    overrides: list[str] = [],  # noqa: B006
+    *,
+    name: str = "vusfa",
+    seed: int = 0,
+    trained: int = 32,
+    tested: int = 8,
+    weight: float = 3.0,
+    temperature: float = 1.0,
+    episodes: int = 10,
+    results: Path = Path("results"),
+    runs: Path = Path("runs"),
+) -> None:
+    """Train in some rooms, test in others that the agent has never seen.
+
+    The agent, whose heads are the same for all rooms, walks to every goal of the other rooms as it is and
+    with a memory of the episode; beside it the random walk and the memory alone. Results go to
+    RESULTS/generalise/NAME-SEED; the table with intervals is of all seeds that are there.
+
+    Args:
+        rooms: folder of dumps (.h5).
+        overrides: settings of recipes/train.py over those of preset=unseen.
+        name: of the results, before the seed.
+        seed: of everything.
+        trained: rooms to train on.
+        tested: rooms to test in.
+        weight: of the memory: off the logits for each time that an action was tried here.
+        temperature: of the agent's logits, beside the memory.
+        episodes: to every goal of the rooms to test in.
+        results: where results are written.
+        runs: where the checkpoint is kept.
+    """
+    torch.set_num_threads(1)
+    first, last = split_rooms(rooms, trained, tested)
+    unseen, folder = SceneSet.open(last), runs / "generalise" / f"{name}-{seed}"
+    settings = ["preset=unseen", *overrides, f"seed={seed}", f"scenes=[{','.join(first)}]"]
+    cfg = compose_settings([*settings, f"folder={folder}", "evaluation=none"])
+    if not (folder / "checkpoint.pt").exists() and (code := train(cfg, settings).exit_code):
+        sys.exit(code)
+    agent, _, state = load_agent(folder / "checkpoint.pt")
+    tables: dict[str, Episodes] = {}
+    with EvaluationProgress() as progress:
+        for who, policy in policies(transplant(agent, unseen).eval(), unseen, weight, temperature).items():
+            tables[who] = evaluate(
+                policy,
+                unseen,
+                episodes_per_goal=episodes,
+                history=agent.config["history"],
+                seed=seed,
+                batch_size=1024,
+                progress=lambda done, total, who=who: progress(who, done, total),  # type: ignore[misc]
+            )
+    facts = {**run_facts(state, overrides), "trained_in": [Path(p).stem for p in first]}
+    info = {**facts, "memory_weight": weight, "temperature": temperature, "tested_in": list(unseen.names)}
+    walk = exact_goals(uniform_probabilities(unseen.num_actions), unseen)
+    print(write_run(results, Run("generalise", f"{name}-{seed}", info, tables, walk)))
+    rows = [row for who, table in tables.items() for row in summary(table, who)]
+    none, every = torch.tensor([], dtype=torch.int64), torch.arange(unseen.num_states)
+    print_summary([*rows, *random_walk_summary(unseen, every, none)])
+    print(unseen_table([run for run in read_runs(results, "generalise") if run.name.startswith(f"{name}-")]))
 
 
 def unseen_table(runs: Sequence[Run]) -> str:

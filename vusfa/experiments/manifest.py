@@ -16,7 +16,7 @@ from torch import Tensor
 
 from vusfa.envs.goals import resolve_goals
 from vusfa.errors import ResultError
-from vusfa.evaluation.navigation import episode_starts
+from vusfa.evaluation.starts import episode_starts
 from vusfa.files import read_npz, replacing
 from vusfa.scenes import SceneSet
 

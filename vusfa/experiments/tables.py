@@ -7,7 +7,6 @@ are over goals, each of which weighs the same, unless a row says "mean of scenes
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
 from functools import lru_cache
 from typing import Any
 
@@ -22,10 +21,9 @@ from vusfa.evaluation.long_table import (
     SUBSETS,
     distance_bin,
 )
-from vusfa.evaluation.metrics import METRICS, get_metric, metrics_within
+from vusfa.evaluation.metrics import metrics_within
 from vusfa.evaluation.statistics import (
     Draws,
-    Estimate,
     Sums,
     bootstrap_improvement,
     bootstrap_iqm,
@@ -40,8 +38,6 @@ __all__ = [
     "COLUMNS",
     "comparison_rows",
     "distance_rows",
-    "flat_rows",
-    "markdown",
     "middle_rows",
     "model_rows",
     "run_rows",
@@ -196,68 +192,6 @@ def comparison_rows(experiment: Experiment, mode: str, resamples: int = 2000) ->
                         row["improvement"] = bootstrap_improvement(better, worse, resamples=resamples)
                     rows.append(row)
     return rows
-
-
-def flat_rows(rows: Iterable[Row]) -> list[Row]:
-    """Rows for CSV: an estimate becomes three columns, NAME, NAME_low and NAME_high; all rows get the same.
-
-    >>> flat_rows([{"model": "gvf", "spl": Estimate(0.5, 0.25, 0.75)}, {"model": "walk"}])[0]
-    {'model': 'gvf', 'spl': 0.5, 'spl_low': 0.25, 'spl_high': 0.75}
-    """
-    flat: list[Row] = []
-    for row in rows:
-        flat.append({})
-        for key, value in row.items():
-            named = zip(("", "_low", "_high"), value, strict=True) if isinstance(value, Estimate) else ()
-            flat[-1] |= {f"{key}{end}": number for end, number in named} or {key: value}
-    names = list(dict.fromkeys(name for row in flat for name in row))
-    return [{name: row.get(name, "") for name in names} for row in flat]
-
-
-def markdown(rows: Sequence[Row], columns: Sequence[str]) -> str:
-    """A table in Markdown; estimates as "value [low, high]", in the units of the registry, and
-    differences of shares in percentage points.
-
-    Args:
-        rows: in order.
-        columns: those to show; one that no row has is left out.
-
-    >>> rows = [{"model": "gvf", "spl": Estimate(0.5, 0.25, 0.75)}, {"model": "walk"}]
-    >>> print(markdown(rows, ["model", "spl"]))
-    | model | SPL, % |
-    |---|---|
-    | gvf | 50.0 [25.0, 75.0] |
-    | walk | – |
-    """
-    shown = [name for name in columns if any(name in row for row in rows)]
-    heads = [get_metric(name).heading if _is_metric(name) else name.replace("_", " ") for name in shown]
-    lines = [f"| {' | '.join(heads)} |", "|" + "---|" * len(shown)]
-    lines += [f"| {' | '.join(_text(name, row.get(name)) for name in shown)} |" for row in rows]
-    return "\n".join(lines)
-
-
-def _is_metric(name: Any) -> bool:
-    return name in METRICS or str(name).startswith("success_")
-
-
-def _text(name: str, value: Any) -> str:
-    if isinstance(value, Estimate):
-        metric = get_metric(name if _is_metric(name) else "success_500")  # differences are of shares
-        low, high = (metric.text(end) for end in value[1:])
-        return metric.text(value.value) + ("" if math.isnan(value.low) else f" [{low}, {high}]")
-    if isinstance(value, bool):
-        return "yes" if value else "no"
-    if isinstance(value, float):
-        return (
-            get_metric("success_500").text(value)
-            if name == "trained"
-            else "–"
-            if math.isnan(value)
-            else f"{value:.1f}"
-        )
-    if isinstance(value, int):
-        return f"{value:,}"
-    return "–" if value is None else get_metric(value).heading if _is_metric(value) else str(value)
 
 
 def _subsets(experiment: Experiment) -> dict[str, Tensor]:

@@ -6,6 +6,10 @@ import sys
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
+from omegaconf import DictConfig, OmegaConf
+
+from vusfa.conf.compose import compose
+from vusfa.conf.schema import register_schema
 from vusfa.evaluation import Comparison, check_comparison, compare, print_summary
 from vusfa.files import check_folder
 from vusfa.training import (
@@ -19,7 +23,7 @@ from vusfa.training import (
     set_threads,
 )
 
-__all__ = ["Trained", "train"]
+__all__ = ["Trained", "compose_settings", "train"]
 
 
 class Trained(NamedTuple):
@@ -34,6 +38,14 @@ class Trained(NamedTuple):
     trainer: Trainer
     comparison: Comparison | None
     exit_code: int
+
+
+def compose_settings(overrides: Sequence[str]) -> DictConfig:
+    """The settings of a training as ``vusfa train`` would make them of these overrides, interpolated."""
+    register_schema()
+    settings = compose(overrides=overrides)
+    OmegaConf.resolve(settings)
+    return settings
 
 
 def train(settings: Mapping[str, Any], overrides: Sequence[str] = ()) -> Trained:

@@ -6,7 +6,8 @@ Pure functions: which goals, and what numbers a curve of episode lengths comes t
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -15,10 +16,31 @@ from vusfa.errors import GoalError
 from vusfa.evaluation.exact import expected_walks
 from vusfa.scenes import SceneSet
 
-__all__ = ["KINDS", "area_under", "frames_to", "new_goals", "walked_lengths"]
+__all__ = [
+    "FINE_TUNED",
+    "FROM_SCRATCH",
+    "KINDS",
+    "area_under",
+    "curves_of",
+    "frames_to",
+    "new_goals",
+    "walked_lengths",
+]
 
+#: What results call the curves of the two trainings.
+FINE_TUNED, FROM_SCRATCH = "fine-tuned", "from scratch"
 #: Fewest actions from a new goal to the nearest trained one; None: any state that is not trained.
 KINDS: dict[str, int | None] = {"1-step": 1, "2-steps": 2, "4-steps": 4, "random": None}
+
+
+def curves_of(info: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """The curves of a run's info, per set of goals; version 0.1 called fine-tuning "trained on".
+
+    >>> curves_of({"curves": [{"goals": [3], "trained on": {"frames": [0]}}]})
+    [{'goals': [3], 'fine-tuned': {'frames': [0]}}]
+    """
+    names = {"trained on": FINE_TUNED}
+    return [{names.get(name, name): part for name, part in entry.items()} for entry in info["curves"]]
 
 
 def new_goals(

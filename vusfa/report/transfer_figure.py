@@ -1,4 +1,4 @@
-"""The table and the picture of recipes/transfer.py, from its results alone."""
+"""The tables and the picture of the paper's Figure 2, from results alone: ``vusfa transfer show``."""
 
 from __future__ import annotations
 
@@ -8,15 +8,26 @@ from pathlib import Path
 
 import torch
 
+from vusfa.errors import ResultError
+from vusfa.evaluation.baselines import RANDOM_WALK, SHORTEST_PATH
 from vusfa.evaluation.statistics import Estimate, Sums, bootstrap_mean
-from vusfa.experiments.runs import Run
-from vusfa.experiments.transfer import KINDS, area_under, frames_to
+from vusfa.experiments.runs import Run, read_runs
+from vusfa.experiments.transfer import (
+    FINE_TUNED,
+    FROM_SCRATCH,
+    KINDS,
+    area_under,
+    curves_of,
+    frames_to,
+    walked_lengths,
+)
 from vusfa.files import replacing
+from vusfa.scenes import SceneSet
 
-__all__ = ["difference_table", "draw_transfer", "mean_over", "transfer_table"]
+__all__ = ["difference_table", "draw_transfer", "mean_over", "show_transfer", "transfer_table"]
 
-WAYS = ("trained on", "from scratch")
-BOUNDS = ("random walk", "shortest path")
+STARTS = (FINE_TUNED, FROM_SCRATCH)
+BOUNDS = (RANDOM_WALK, SHORTEST_PATH)
 PAIRS = (("usfa", "gvf"), ("sfdp", "usfa"), ("vusfa", "sfdp"), ("vusfa", "gvf"))
 _COLOURS = {"gvf": "#0072b2", "usfa": "#e69f00", "sfdp": "#009e73", "vusfa": "#cc79a7"}
 
@@ -56,8 +67,8 @@ def transfer_table(
     ]
     for kind, model, here in _groups(runs):
         kinds += [] if kind in kinds else [kind]
-        for way in WAYS:
-            curves = [[entry[way] for entry in run.info["curves"]] for run in here]
+        for start in STARTS:
+            curves = [[entry[start] for entry in curves_of(run.info)] for run in here]
             area = mean_over([[area_under(c["frames"], c["length"]) for c in row] for row in curves])
             first, last = (mean_over([[c["length"][end] for c in row] for row in curves]) for end in (0, -1))
             to = [[frames_to(c["frames"], c["length"], threshold) for c in row] for row in curves]
@@ -65,7 +76,7 @@ def transfer_table(
             total = sum(len(row) for row in to)
             reached = _number(mean_over(to), 0) if arrived else "-"
             lines.append(
-                f"| {kind} | {model} | {way} | {len(here)} | {_number(area)} | {_number(first)} |"
+                f"| {kind} | {model} | {start} | {len(here)} | {_number(area)} | {_number(first)} |"
                 f" {_number(last)} | {reached} | {arrived} of {total} |"
             )
     for kind in kinds:
@@ -77,7 +88,7 @@ def transfer_table(
 
 def difference_table(runs: Sequence[Run]) -> str:
     """Markdown: differences of the mean length over the training, paired by seed and set of goals, with 95 %
-    intervals: of each model trained on from the same model from scratch, and of neighbours trained on.
+    intervals: of each model fine-tuned from the same model from scratch, and of neighbors fine-tuned.
 
     Less than 0: fewer actions than what it is compared with.
 
@@ -86,18 +97,18 @@ def difference_table(runs: Sequence[Run]) -> str:
     """
     areas: dict[tuple[str, str, str], dict[int, list[float]]] = {}
     for run in runs:
-        for way in WAYS:
-            here = areas.setdefault((run.info["kind"], run.info["model"], way), {})
-            curves = [entry[way] for entry in run.info["curves"]]
+        for start in STARTS:
+            here = areas.setdefault((run.info["kind"], run.info["model"], start), {})
+            curves = [entry[start] for entry in curves_of(run.info)]
             here[run.info["seed"]] = [area_under(c["frames"], c["length"]) for c in curves]
     lines = [
-        "| new goals | trained on | against | seeds | difference, mean of the curve |",
+        "| new goals | fine-tuned | against | seeds | difference, mean of the curve |",
         "|---|---|---|---|---|",
     ]
     for kind in KINDS:
-        models = [model for model in _COLOURS if (kind, model, WAYS[0]) in areas]
-        pairs = [((model, WAYS[0]), (model, WAYS[1])) for model in models]
-        pairs += [((a, WAYS[0]), (b, WAYS[0])) for a, b in PAIRS if a in models and b in models]
+        models = [model for model in _COLOURS if (kind, model, STARTS[0]) in areas]
+        pairs = [((model, STARTS[0]), (model, STARTS[1])) for model in models]
+        pairs += [((a, STARTS[0]), (b, STARTS[0])) for a, b in PAIRS if a in models and b in models]
         for one, other in pairs:
             left, right = areas[(kind, *one)], areas[(kind, *other)]
             seeds = sorted(left.keys() & right.keys())
@@ -123,14 +134,14 @@ def draw_transfer(
     panels = figure.subplots(1, len(kinds), sharey=True, squeeze=False)[0]
     for kind, model, here in _groups(runs):
         panel = panels[kinds.index(kind)]
-        for way, style in zip(WAYS, ("-", ":"), strict=True):
-            curves = [[entry[way] for entry in run.info["curves"]] for run in here]
+        for start, style in zip(STARTS, ("-", ":"), strict=True):
+            curves = [[entry[start] for entry in curves_of(run.info)] for run in here]
             frames = curves[0][0]["frames"]
             points = [
                 mean_over([[c["length"][i] for c in row] for row in curves]) for i in range(len(frames))
             ]
             thousand = [frame / 1000 for frame in frames]
-            label = model if way == WAYS[0] else f"{model}, from scratch"
+            label = model if start == FINE_TUNED else f"{model}, from scratch"
             colour = _COLOURS.get(model, "#555555")
             panel.plot(thousand, [p.value for p in points], style, color=colour, label=label)
             panel.fill_between(
@@ -164,3 +175,31 @@ def _groups(runs: Sequence[Run]) -> list[tuple[str, str, list[Run]]]:
 def _number(estimate: Estimate, digits: int = 1) -> str:
     value, low, high = (f"{part:,.{digits}f}" for part in (estimate.value, estimate.low, estimate.high))
     return f"{value} [{low}, {high}]"
+
+
+def show_transfer(
+    *,
+    results: Path = Path("results"),
+    experiment: str = "transfer",
+    threshold: float = 250.0,
+    scenes: list[str] | None = None,
+    out: Path = Path("transfer.png"),
+) -> None:
+    """Print the tables of ``vusfa transfer run``, and draw the figure.
+
+    Args:
+        results: folder of results.
+        experiment: whose results.
+        threshold: actions an episode; the table tells after how many frames the mean comes down to it. Half
+            of those that are allowed when not given.
+        scenes: bundled names and files, in order; the bundled rooms that the runs name when not given.
+        out: the picture.
+    """
+    found = read_runs(results, experiment)
+    if not found:
+        raise ResultError(f"{results / experiment}: no results; run recipes/transfer.py run first")
+    world = SceneSet.open(scenes or found[0].info["scenes"])
+    sets = {run.info["kind"]: [entry["goals"] for entry in curves_of(run.info)] for run in found}
+    bounds = {kind: [walked_lengths(world, torch.tensor(g)) for g in goals] for kind, goals in sets.items()}
+    print(transfer_table(found, threshold, bounds), difference_table(found), sep="\n\n")
+    print(draw_transfer(found, out, bounds))

@@ -1,0 +1,96 @@
+"""All tables of experiments from results on disk: ``vusfa tables``."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+from vusfa.evaluation.long_table import MEAN_OF_STATES, SUBSETS
+from vusfa.experiments.experiment import read_experiment
+from vusfa.experiments.markdown import flat_rows, markdown
+from vusfa.experiments.tables import (
+    COLUMNS,
+    comparison_rows,
+    distance_rows,
+    middle_rows,
+    model_rows,
+    run_rows,
+)
+from vusfa.files import check_folder, write_csv
+from vusfa.scenes import SceneSet
+from vusfa.training import set_threads
+
+__all__ = ["print_tables"]
+
+MODES = {"sampled": "actions drawn", "greedy": "the likeliest action", "exact": "computed, actions drawn"}
+
+
+def print_tables(
+    experiments: list[str] = ["table1"],  # noqa: B006
+    *,
+    results: Path = Path("results"),
+    out: Path | None = None,
+    scenes: list[str] | None = None,
+    resamples: int = 2000,
+    threads: int = 1,
+) -> None:
+    """Print the tables of experiments that share their episodes, in Markdown and with 95 % intervals.
+
+    Intervals are over seeds and goals; the tables are written as CSV, too, unrounded. Nothing is trained and
+    no episode is walked: the numbers come from the episodes in RESULTS.
+
+    Args:
+        experiments: folders of results, shown together.
+        results: where they lie.
+        out: folder for the CSV files; RESULTS/tables when not given.
+        scenes: bundled names and files, in order; the bundled rooms that the runs name when not given.
+        resamples: of the bootstrap.
+        threads: processor threads; more than 1 pays on an idle machine only.
+    """
+    set_threads(threads)
+    folder = check_folder(out or results / "tables", "out")
+    experiment = read_experiment(results, experiments, SceneSet.open(scenes) if scenes else None)
+    names = ["model", "seeds", "num_goals", *COLUMNS]
+
+    runs = run_rows(experiment)
+    show(
+        "Runs",
+        runs,
+        ["model", "seed", "frames", "checkpoint", "training_s", "trained", "solved", "exact_z"],
+    )
+    unsolved = [
+        f"{row['model']} of seed {row['seed']} ({100 * row['trained']:.1f} % after {row['frames']:,} frames)"
+        for row in runs
+        if row["frames"] and not row["solved"]
+    ]
+    if unsolved:
+        print(f"Trained goals NOT solved (success below 90 %): {'; '.join(unsolved)}.\n")
+    every, far, middle, compared = [], [], [], []
+    for mode, words in MODES.items():
+        found = model_rows(experiment, mode, resamples)
+        for subset in SUBSETS:
+            rows = [row for row in found if (row["goals"], row["scene"]) == (subset, MEAN_OF_STATES)]
+            show(f"{subset.capitalize()} goals, {words}", rows, names)
+        if mode == "sampled":
+            for subset in ("unseen", "all"):
+                rows = [row for row in found if row["goals"] == subset]
+                show(f"Scene by scene, {subset} goals, {words}", rows, ["scene", *names])
+        every += found
+        far += distance_rows(experiment, mode, resamples)
+        middle += middle_rows(experiment, mode, resamples)
+        compared += comparison_rows(experiment, mode, resamples)
+    drawn = [[row for row in rows if row["mode"] == "sampled"] for rows in (far, middle, compared)]
+    show("By actions from the nearest trained goal, actions drawn", drawn[0], ["distance", *names])
+    show("Interquartile mean over seeds and scenes, actions drawn", drawn[1], ["goals", *names])
+    columns = ["goals", "measure", "model", "against", "seeds", "difference", "improvement"]
+    show("Paired differences and chances of improvement, both in %, actions drawn", drawn[2], columns)
+    for name, rows in (
+        ("runs", runs), ("models", every), ("distance", far), ("middle", middle), ("compared", compared),
+    ):  # fmt: skip
+        print(write_csv(folder / f"{name}.csv", flat_rows(rows)), file=sys.stderr)
+
+
+def show(title: str, rows: list[dict[str, object]], columns: list[str]) -> None:
+    """Print a table with its title; nothing for no rows."""
+    if rows:
+        print(f"### {title}\n\n{markdown(rows, columns)}\n")

@@ -1,0 +1,83 @@
+"""The paper's Figure 2, its runs: ``vusfa transfer run``."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+
+from rich.console import Console
+from rich.progress import track
+
+from vusfa.errors import CheckpointError
+from vusfa.experiments.fine_tune import fine_tune, fine_tuning_settings
+from vusfa.experiments.runs import Run, read_run, write_run
+from vusfa.experiments.transfer import FINE_TUNED, FROM_SCRATCH, KINDS, new_goals
+from vusfa.modules.presets import MODELS
+from vusfa.training import load_agent, run_facts, set_threads
+
+__all__ = ["run_transfer"]
+
+
+def run_transfer(
+    *,
+    models: list[str] = list(MODELS),  # noqa: B006
+    seeds: list[int] = [0, 1, 2, 3, 4],  # noqa: B006
+    kinds: list[str] = list(KINDS),  # noqa: B006
+    sets: int = 5,
+    frames: int = 500_000,
+    every: int = 50_000,
+    source: str = "table1",
+    results: Path = Path("results"),
+    runs: Path = Path("runs"),
+    experiment: str = "transfer",
+) -> None:
+    """Fine-tune the trained models of Table 1 towards new goals near and far; train from scratch beside it.
+
+    Results go to RESULTS/EXPERIMENT/MODEL-SEED-KIND; what is there is skipped. ``vusfa transfer show`` draws
+    the figure and prints the tables.
+
+    Args:
+        models: of the four.
+        seeds: of the runs that are fine-tuned.
+        kinds: of new goals.
+        sets: of goals, each kind.
+        frames: of each training.
+        every: frames between two points of a curve.
+        source: experiment whose chosen checkpoints are fine-tuned.
+        results: where results are read and written.
+        runs: where that experiment's checkpoints lie.
+        experiment: where results go.
+    """
+    set_threads(1)
+    for seed in seeds:
+        for kind in kinds:
+            for model in models:
+                name = f"{model}-{seed}-{kind}"
+                if (results / experiment / name / "cell.json").exists():
+                    print(f"{results / experiment / name}: already there")
+                    continue
+                trained = read_run(results, source, f"{model}-{seed}").info["checkpoint"]
+                checkpoint = runs / source / f"{model}-{seed}" / trained
+                if not checkpoint.exists():
+                    raise CheckpointError(
+                        f"{checkpoint}: missing; run recipes/table1.py with the same --runs"
+                    )
+                _, scenes, state = load_agent(checkpoint)
+                began, curves = time.monotonic(), []
+                for index in track(range(sets), description=name, console=Console(stderr=True)):
+                    goals = new_goals(scenes, state["goals"], kind, index)
+                    settings = fine_tuning_settings(state["config"], goals, frames, seed)
+                    pair = {
+                        label: fine_tune(start, settings, scenes, every=every)
+                        for label, start in ((FINE_TUNED, state), (FROM_SCRATCH, None))
+                    }
+                    curves.append({"goals": goals.tolist(), **pair})
+                info = {
+                    **run_facts(state),
+                    "kind": kind,
+                    "frames": frames,
+                    "cell_s": round(time.monotonic() - began, 1),
+                    "command": f"recipes/transfer.py run --models {model} --seeds {seed} --kinds {kind}",
+                    "curves": curves,
+                }
+                print(write_run(results, Run(experiment, name, info, {})))

@@ -1,0 +1,91 @@
+"""The paper's Table 1: ``vusfa table1``."""
+
+from __future__ import annotations
+
+import dataclasses
+import shutil
+import sys
+import time
+from pathlib import Path
+
+from omegaconf import open_dict
+
+from vusfa.experiments.measure import choose_checkpoint, measure_checkpoint
+from vusfa.experiments.runs import read_run, write_run
+from vusfa.experiments.training import compose_settings, train
+from vusfa.files import replacing
+from vusfa.modules.presets import MODELS
+
+__all__ = ["checkpoints", "table1"]
+
+
+def checkpoints(folder: Path, overrides: list[str], stages: list[float]) -> list[Path]:
+    """Train as far as each stage and keep a checkpoint there; those that are there already are kept."""
+    cfg = compose_settings([*overrides, f"folder={folder}", "evaluation=none"])
+    # interpolated now: schedules end where the whole training ends, whichever part of it runs
+    total, last = cfg.total_frames, folder / "checkpoint.pt"
+    kept = [folder / f"checkpoint-{round(100 * stage)}.pt" for stage in stages]
+    for stage, path in zip(stages, kept, strict=True):
+        if path.exists():
+            continue
+        with open_dict(cfg):
+            cfg.total_frames, cfg.resume = round(stage * total), str(last) if last.exists() else None
+        code = train(cfg, overrides).exit_code
+        if code:
+            sys.exit(code)
+        with replacing(path) as unfinished:
+            shutil.copy(last, unfinished)
+    return kept
+
+
+def table1(
+    overrides: list[str] = [],  # noqa: B006
+    *,
+    experiment: str = "table1",
+    models: list[str] = ["untrained", *MODELS],  # noqa: B006
+    seeds: list[int] = [0, 1, 2, 3, 4],  # noqa: B006
+    stages: list[float] = [0.8, 0.9, 1.0],  # noqa: B006
+    results: Path = Path("results"),
+    runs: Path = Path("runs"),
+    manifest: Path | None = None,
+    again: bool = False,
+) -> None:
+    """The paper's Table 1: train, choose a checkpoint and evaluate, per model and seed.
+
+    Results go to RESULTS/EXPERIMENT/MODEL-SEED; what is there is skipped, what was cut off goes on.
+    "untrained" is VUSFA before its first update. ``vusfa tables`` prints the tables.
+
+    Args:
+        overrides: settings of recipes/train.py, such as preset=paper.
+        experiment: name of the table.
+        models: of the four, and untrained.
+        seeds: paired: all models get the same ones.
+        stages: parts of the training after which a checkpoint is a candidate.
+        results: where results are written.
+        runs: where trainings keep their checkpoints.
+        manifest: of episodes; that of the bundled rooms when not given.
+        again: measure anew the results that are there, from the checkpoints that were chosen.
+    """
+    for seed in seeds:
+        for model in models:
+            name, began = f"{model}-{seed}", time.monotonic()
+            run, there = runs / experiment / name, (results / experiment / name / "cell.json").exists()
+            if there and not again:
+                print(f"{results / experiment / name}: already there")
+                continue
+            if there:
+                info = read_run(results, experiment, name).info
+                chosen, settings = run / info["checkpoint"], info["overrides"]
+                facts = {key: info[key] for key in ("validation_spl", "cell_s") if key in info}
+                facts |= {"model": model, "row": model} if model == "untrained" else {}
+            else:
+                untrained = model == "untrained"
+                settings = [*overrides, f"agent.model={'vusfa' if untrained else model}", f"seed={seed}"]
+                kept = checkpoints(run, settings, [0.0] if untrained else sorted(stages))
+                scores = choose_checkpoint(kept, manifest)
+                chosen = next(iter(scores))
+                facts = {"validation_spl": {path.name: score for path, score in scores.items()}}
+                facts |= {"model": model, "row": model} if untrained else {}
+            measured = measure_checkpoint(chosen, experiment, name, settings, manifest)
+            facts.setdefault("cell_s", round(time.monotonic() - began, 1))
+            print(write_run(results, dataclasses.replace(measured, info={**measured.info, **facts})))

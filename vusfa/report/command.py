@@ -1,0 +1,81 @@
+"""A page from the command line: ``vusfa report``."""
+
+from __future__ import annotations
+
+import shlex
+import sys
+import uuid
+from pathlib import Path
+from typing import Literal
+
+from vusfa.files import check_folder
+from vusfa.report.build import write_report
+from vusfa.report.cells import read_source
+from vusfa.report.content import Options
+from vusfa.report.page import even
+from vusfa.training import set_threads
+from vusfa.training.loggers import make_loggers
+
+__all__ = ["report_runs"]
+
+
+def report_runs(
+    sources: list[str],
+    *,
+    out: Path = Path("report.html"),
+    title: str = "What the runs learned",
+    goals_per_scene: int = 24,
+    seeds: int = 1,
+    walks: int = 3,
+    max_steps: int = 500,
+    mode: Literal["sampled", "greedy"] = "sampled",
+    runs: Path = Path("runs"),
+    megabytes: float = 40.0,
+    wandb: Literal["online", "offline"] | None = None,
+    project: str = "vusfa",
+    threads: int = 1,
+) -> None:
+    """Write one HTML page of runs and results, which needs nothing from outside.
+
+    Its tables lie beside it as CSV, unrounded, in the folder PAGE_tables. NAME=FOLDER calls a model
+    NAME; runs of one name are seeds of one thing.
+
+    Args:
+        sources: folders of runs of vusfa train, of results, or of experiments.
+        out: the page.
+        title: of the page.
+        goals_per_scene: goals of each scene in the explorer, at most.
+        seeds: runs of each model in the explorer, the first ones given.
+        walks: sampled walks to each of these goals.
+        max_steps: actions allowed in these walks.
+        mode: of the evaluations that results hold.
+        runs: where the trainings of results keep logs and checkpoints, as RUNS/EXPERIMENT/CELL.
+        megabytes: what the page may weigh; goals, then pictures are left out to keep it.
+        wandb: send the tables to W&B, too; offline leaves them beside the page.
+        project: of W&B.
+        threads: processor threads; more than 1 pays on an idle machine only.
+    """
+    set_threads(threads)
+    check_folder(out.absolute().parent, "out")
+    options = Options(
+        title=title,
+        goals_per_scene=goals_per_scene,
+        seeds=seeds,
+        walks=walks,
+        max_steps=max_steps,
+        megabytes=megabytes,
+        command=shlex.join(["vusfa", "report", *sources, "--out", str(out)]),
+        tell=lambda line: print(line, file=sys.stderr),
+    )
+    read = [run for source in sources for run in read_source(source, mode, runs)]
+    paths, tables = write_report(read, out, options)
+    if wandb:
+        kept, made = {"sources": sources, "title": title}, uuid.uuid4().hex[:8]
+        with make_loggers(
+            ["wandb"], out.absolute().parent, kept, run_id=made, project=project, mode=wandb, name=title
+        ) as loggers:
+            for name, rows in tables.items():
+                if rows:
+                    loggers.log_table(name, even(rows), 0)
+    for path in paths:
+        print(path)
