@@ -6,7 +6,7 @@ The same as ``vusfa report``; read vusfa/report.
 from __future__ import annotations
 
 from vusfa.cli.functions import run_functions
-from vusfa.report.command import report_runs
+from vusfa.report.command import report_runs as report
 
 if __name__ == "__main__":
-    run_functions(report_runs)
+    run_functions(report)

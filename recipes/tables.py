@@ -6,7 +6,7 @@ The same as ``vusfa tables``; read vusfa/experiments/print_tables.py, and tables
 from __future__ import annotations
 
 from vusfa.cli.functions import run_functions
-from vusfa.experiments.print_tables import print_tables
+from vusfa.experiments.print_tables import print_tables as tables
 
 if __name__ == "__main__":
-    run_functions(print_tables)
+    run_functions(tables)

@@ -8,8 +8,8 @@ as ``vusfa transfer``; read vusfa/experiments/run_transfer.py and fine_tune.py.
 from __future__ import annotations
 
 from vusfa.cli.functions import run_functions
-from vusfa.experiments.run_transfer import run_transfer
-from vusfa.report.transfer_figure import show_transfer
+from vusfa.experiments.run_transfer import run_transfer as run
+from vusfa.report.transfer_figure import show_transfer as show
 
 if __name__ == "__main__":
-    run_functions(run=run_transfer, show=show_transfer)
+    run_functions(run=run, show=show)

@@ -28,7 +28,7 @@ def test_all_tables(recipe: Callable[[str], Any], tmp_path: Path, capsys: pytest
         SMALL, models=["gvf", "vusfa"], seeds=[0], stages=[1.0], results=results, runs=tmp_path / "runs"
     )
     capsys.readouterr()
-    recipe("tables").print_tables(["table1"], results=results, resamples=50)
+    recipe("tables").tables(["table1"], results=results, resamples=50)
     out = capsys.readouterr().out
     for title in (
         "Runs",
@@ -50,4 +50,4 @@ def test_all_tables(recipe: Callable[[str], Any], tmp_path: Path, capsys: pytest
 
 def test_no_results(recipe: Callable[[str], Any], tmp_path: Path) -> None:
     with pytest.raises(ResultError, match=r"run recipes/table1\.py first"):
-        recipe("tables").print_tables(results=tmp_path)
+        recipe("tables").tables(results=tmp_path)

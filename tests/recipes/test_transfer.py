@@ -31,18 +31,16 @@ def test_run_and_show(
 ) -> None:
     transfer = recipe("transfer")
     asked = {"models": ["gvf"], "seeds": [0], "kinds": ["random"], "sets": 2, "frames": 96, "every": 48}
-    transfer.run_transfer(**asked, **folders)
+    transfer.run(**asked, **folders)
     info = read_run(folders["results"], "transfer", "gvf-0-random").info
     assert [len(entry["goals"]) for entry in info["curves"]] == [5, 5]
     assert info["curves"][0]["fine-tuned"]["frames"] == [0, 48, 96]
     assert info["curves"][0]["fine-tuned"] != info["curves"][0]["from scratch"]
     assert {3, 9, 12}.isdisjoint(info["curves"][0]["goals"])
     capsys.readouterr()
-    transfer.run_transfer(**asked, **folders)
+    transfer.run(**asked, **folders)
     assert "already there" in capsys.readouterr().out
-    transfer.show_transfer(
-        results=folders["results"], out=tmp_path / "transfer.png", scenes=[str(scene_file)]
-    )
+    transfer.show(results=folders["results"], out=tmp_path / "transfer.png", scenes=[str(scene_file)])
     printed = capsys.readouterr().out
     assert "| random | gvf | fine-tuned | 1 |" in printed
     assert (tmp_path / "transfer.png").exists()
@@ -51,6 +49,6 @@ def test_run_and_show(
 def test_what_is_missing(recipe: Callable[[str], Any], folders: dict[str, Path], tmp_path: Path) -> None:
     transfer = recipe("transfer")
     with pytest.raises(CheckpointError, match=r"checkpoint\.pt: missing; run recipes/table1"):
-        transfer.run_transfer(models=["gvf"], seeds=[0], results=folders["results"], runs=tmp_path)
+        transfer.run(models=["gvf"], seeds=[0], results=folders["results"], runs=tmp_path)
     with pytest.raises(VusfaError, match=r"run recipes/transfer\.py run first"):
-        transfer.show_transfer(results=folders["results"])
+        transfer.show(results=folders["results"])

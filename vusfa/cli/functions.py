@@ -74,7 +74,7 @@ def as_command(function: Callable[..., Any]) -> Callable[..., Any]:
             typer.echo(f"error: {error}", err=True)
             raise typer.Exit(1) from error
         except KeyboardInterrupt as interrupt:
-            typer.echo("error: interrupted", err=True)
+            typer.echo(f"error: {str(interrupt) or 'interrupted'}", err=True)
             raise typer.Exit(130) from interrupt
 
     command.__doc__ = text

@@ -72,22 +72,25 @@ def zero_shot(
     untrained = rebuild_agent(agent.config, world).to(device)
     policies = {row_name(state["config"]): agent, "untrained": untrained}
     every = world if goals == "all" else None
-    with EvaluationProgress() as progress, evaluation_precision(agent, state["config"]):
-        result = compare(
-            {name: evaluation_policy(policy, every) for name, policy in policies.items()},
-            world,
-            goals,
-            trained=state["goals"],
-            progress=progress,
-            episodes_per_goal=episodes,
-            max_steps=max_steps,
-            history=agent.config["history"],
-            observe=make_observation(agent, world),
-            sample=not greedy,
-            unreachable=unreachable,
-            seed=seed if walks is None else walks.seed,
-            episodes=None if walks is None else walks.episodes(world),
-        )
+    try:
+        with EvaluationProgress() as progress, evaluation_precision(agent, state["config"]):
+            result = compare(
+                {name: evaluation_policy(policy, every) for name, policy in policies.items()},
+                world,
+                goals,
+                trained=state["goals"],
+                progress=progress,
+                episodes_per_goal=episodes,
+                max_steps=max_steps,
+                history=agent.config["history"],
+                observe=make_observation(agent, world),
+                sample=not greedy,
+                unreachable=unreachable,
+                seed=seed if walks is None else walks.seed,
+                episodes=None if walks is None else walks.episodes(world),
+            )
+    except KeyboardInterrupt as interrupt:
+        raise KeyboardInterrupt("interrupted; nothing has been written") from interrupt
     result.settings["manifest"] = manifest
     print_summary(result.rows, note=result.note)
     for path in result.save(stem):
