@@ -146,3 +146,21 @@ def test_one_picture_for_many_states_is_not_multiplied(
     monkeypatch.setattr(Path, "stat", lambda self: os.stat_result([0o100644, 0, 0, 0, 0, 0, 20_000, 0, 0, 0]))
     with pytest.raises(SceneError, match="has more bytes than the file"):
         read_jpegs(path)
+
+
+def test_pictures_of_one_color_are_read_whatever_their_size(make_file: Make) -> None:
+    black = np.zeros((5, 2600, 2600, 3), np.uint8)  # 101 MB
+    path = make_file()
+    with h5py.File(path, "a") as file:
+        file.create_dataset("observation", data=black, chunks=(1, 2600, 2600, 3), compression=9)
+    assert path.stat().st_size < black.nbytes / 500
+    assert validate(path) == []
+
+
+def test_chunks_are_bounded(make_file: Make, pictures: np.ndarray, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = make_file()
+    with h5py.File(path, "a") as file:
+        file.create_dataset("observation", data=pictures, chunks=pictures.shape)
+    assert validate(path) == []
+    monkeypatch.setattr("vusfa.scenes.limits.MAX_CHUNK_BYTES", 700)
+    assert "has chunks of shape (5, 6, 8, 3); at most 700 bytes" in fault(path)

@@ -5,6 +5,7 @@ They are far above every scene that is known and far below what fills a machine.
 
 from __future__ import annotations
 
+import math
 import reprlib
 from pathlib import Path
 from typing import Any
@@ -12,8 +13,10 @@ from typing import Any
 import h5py
 
 __all__ = [
+    "MAX_CHUNK_BYTES",
     "MAX_COMPRESSION",
     "MAX_FURNITURE",
+    "MAX_PICTURE_COMPRESSION",
     "MAX_PICTURE_SIDE",
     "MAX_STATES",
     "MAX_TEXT_BYTES",
@@ -32,7 +35,11 @@ MAX_PICTURE_SIDE = 4096
 PICTURE_FORMATS = ("JPEG", "PNG")
 #: Size of a dataset over its size in the file. Tables of distances have about 10.
 MAX_COMPRESSION = 200
-#: Datasets of at most this size need not keep to it.
+#: The same for raw pictures, which are read some at a time: what gzip reaches with a single color.
+MAX_PICTURE_COMPRESSION = 1100
+#: Size of a chunk, which is read as a whole.
+MAX_CHUNK_BYTES = 1 << 28
+#: Datasets of at most this size need not keep to a compression.
 UNCOMPRESSED_BYTES = 1 << 26
 #: Size of a YAML file: goals, archives, plans.
 MAX_TEXT_BYTES = 1 << 20
@@ -45,11 +52,13 @@ def size_fault(dataset: h5py.Dataset) -> str | None:
     if dataset.shape and dataset.shape[0] > MAX_STATES:
         return f"declares {dataset.shape[0]} states; at most {MAX_STATES} are read"
     stored = dataset.id.get_storage_size()
-    if dataset.nbytes > max(UNCOMPRESSED_BYTES, MAX_COMPRESSION * stored):
+    times = MAX_PICTURE_COMPRESSION if dataset.ndim == 4 else MAX_COMPRESSION
+    if dataset.nbytes > max(UNCOMPRESSED_BYTES, times * stored):
         return (
-            f"declares {dataset.nbytes} bytes, but {stored} are stored; at most {MAX_COMPRESSION} times as"
-            f" many are read"
+            f"declares {dataset.nbytes} bytes, but {stored} are stored; at most {times} times that are read"
         )
+    if dataset.chunks and math.prod(dataset.chunks) * dataset.dtype.itemsize > MAX_CHUNK_BYTES:
+        return f"has chunks of shape {dataset.chunks}; at most {MAX_CHUNK_BYTES} bytes a chunk are read"
     return None
 
 
