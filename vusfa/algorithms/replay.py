@@ -233,6 +233,9 @@ class HindsightReplay:
             )
         if length:
             self.buffer.extend(TensorDict(state["rows"], [length]))
-            self.buffer.writer.load_state_dict(state["writer"])
+            writer = state["writer"]
+            if isinstance(writer, int):  # of version 0.1: the position alone
+                writer = dict.fromkeys(self.buffer.writer.state_dict(), writer)
+            self.buffer.writer.load_state_dict(writer)
         self._clock = state["clock"]
         self.sampler.load_state_dict(state["sampler"])

@@ -34,7 +34,7 @@ def upgrade(state: Mapping[str, Any]) -> dict[str, Any]:
     algorithm = {"loss": state.get("loss", {})}
     if state.get("replay"):
         replay = dict(state["replay"])
-        replay["writer"] = {"_cursor": replay.pop("cursor")}  # torchrl's own name in its writer's state
+        replay["writer"] = replay.pop("cursor")
         algorithm["replay"] = replay
     new |= {"format": 2, "algorithm": algorithm, "optimizer": state.get("optimiser", {})}
     new["config"] = upgrade_config(state.get("config", {}))
