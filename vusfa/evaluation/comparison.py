@@ -11,6 +11,7 @@ import torch
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
+from vusfa.envs.dynamics import MAX_STEPS
 from vusfa.envs.goals import resolve_goals
 from vusfa.errors import ConfigError, GoalError
 from vusfa.evaluation.baselines import SHORTEST_PATH, shortest_paths
@@ -63,7 +64,7 @@ def check_comparison(
     goals: Any,
     *,
     episodes_per_goal: int = 10,
-    max_steps: int = 500,
+    max_steps: int = MAX_STEPS,
     unreachable: Unreachable = "skip",
     **settings: Any,
 ) -> None:

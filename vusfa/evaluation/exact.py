@@ -18,6 +18,7 @@ import torch
 from scipy import sparse
 from torch import Tensor
 
+from vusfa.envs.dynamics import MAX_STEPS
 from vusfa.evaluation.episodes import Episodes
 from vusfa.evaluation.metrics import metrics_within
 from vusfa.scenes import SceneSet
@@ -81,7 +82,7 @@ class ExpectedWalks(NamedTuple):
 
 @torch.no_grad()
 def expected_walks(
-    probabilities: Probabilities | None, scenes: SceneSet, goals: Tensor, max_steps: int = 500
+    probabilities: Probabilities | None, scenes: SceneSet, goals: Tensor, max_steps: int = MAX_STEPS
 ) -> ExpectedWalks:
     r"""What walks to some goals come to in expectation, with T the actions until arrival and K ``max_steps``:
     E[min(T, K)], P(T <= K), E[T; T <= K].
@@ -116,7 +117,7 @@ def exact_goals(
     scenes: SceneSet,
     *,
     within: Sequence[int] = (500, 100),
-    max_steps: int = 500,
+    max_steps: int = MAX_STEPS,
     at_once: int | None = None,
 ) -> ExactGoals:
     """Every state of every scene as a goal, from every start that it can be reached from.

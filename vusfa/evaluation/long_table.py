@@ -15,6 +15,7 @@ import pandas as pd
 import torch
 from torch import Tensor
 
+from vusfa.envs.dynamics import MAX_STEPS
 from vusfa.evaluation.baselines import RANDOM_WALK, random_walk
 from vusfa.evaluation.episodes import Episodes
 from vusfa.evaluation.exact import ExactGoals
@@ -121,7 +122,7 @@ def random_walk_rows(
     scenes: SceneSet,
     goals: Tensor,
     trained: Tensor,
-    max_steps: int = 500,
+    max_steps: int = MAX_STEPS,
     within: Sequence[int] = WITHIN,
     unreachable: Unreachable = "skip",
 ) -> pd.DataFrame:

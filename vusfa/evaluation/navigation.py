@@ -17,7 +17,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from vusfa.envs.dynamics import Rewards, start_history, step
+from vusfa.envs.dynamics import MAX_STEPS, Rewards, start_history, step
 from vusfa.envs.goals import resolve_goals
 from vusfa.errors import ConfigError
 from vusfa.evaluation.episodes import Episodes
@@ -39,7 +39,7 @@ def evaluate(
     trained: Tensor | None = None,
     episodes: tuple[Tensor, Tensor] | None = None,
     episodes_per_goal: int = 10,
-    max_steps: int = 500,
+    max_steps: int = MAX_STEPS,
     history: int = 4,
     sample: bool = True,
     unreachable: Unreachable = "skip",
@@ -215,7 +215,7 @@ def trails(
     start: Tensor,
     goal: Tensor,
     *,
-    max_steps: int = 500,
+    max_steps: int = MAX_STEPS,
     history: int = 4,
     seed: int = 0,
     observe: Observe | None = None,

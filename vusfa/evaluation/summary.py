@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import pandas as pd
 from torch import Tensor
 
+from vusfa.envs.dynamics import MAX_STEPS
 from vusfa.evaluation.episodes import Episodes
 from vusfa.evaluation.long_table import (
     SUBSETS,
@@ -98,7 +99,7 @@ def random_walk_summary(
     scenes: SceneSet,
     goals: Tensor,
     trained: Tensor,
-    max_steps: int = 500,
+    max_steps: int = MAX_STEPS,
     within: Sequence[int] = WITHIN,
     unreachable: Unreachable = "skip",
 ) -> list[Row]:

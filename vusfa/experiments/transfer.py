@@ -12,6 +12,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from vusfa.envs.dynamics import MAX_STEPS
 from vusfa.errors import GoalError
 from vusfa.evaluation.exact import expected_walks
 from vusfa.scenes import SceneSet
@@ -91,7 +92,7 @@ def new_goals(
     return torch.cat(found)
 
 
-def walked_lengths(scenes: SceneSet, goals: Tensor, max_steps: int = 500) -> tuple[float, float]:
+def walked_lengths(scenes: SceneSet, goals: Tensor, max_steps: int = MAX_STEPS) -> tuple[float, float]:
     """Actions an episode of a random walk and of the shortest path, means over goals and over all starts
     that a goal can be reached from, see :func:`~vusfa.evaluation.exact.expected_walks`.
 

@@ -7,6 +7,7 @@ from typing import Literal
 
 import torch
 
+from vusfa.envs.dynamics import MAX_STEPS
 from vusfa.evaluation import compare, print_summary
 from vusfa.experiments.manifest import BUNDLED_MANIFEST, read_manifest
 from vusfa.experiments.measure import evaluation_policy, evaluation_precision
@@ -29,7 +30,7 @@ def zero_shot(
     *,
     scenes: list[str] | None = None,
     episodes: int = 10,
-    max_steps: int = 500,
+    max_steps: int = MAX_STEPS,
     goals: str = "all",
     manifest: str | None = None,
     greedy: bool = False,

@@ -8,6 +8,7 @@ import uuid
 from pathlib import Path
 from typing import Literal
 
+from vusfa.envs.dynamics import MAX_STEPS
 from vusfa.files import check_folder
 from vusfa.report.build import write_report
 from vusfa.report.cells import read_source
@@ -27,7 +28,7 @@ def report_runs(
     goals_per_scene: int = 24,
     seeds: int = 1,
     walks: int = 3,
-    max_steps: int = 500,
+    max_steps: int = MAX_STEPS,
     mode: Literal["sampled", "greedy"] = "sampled",
     runs: Path = Path("runs"),
     megabytes: float = 40.0,

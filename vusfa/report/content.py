@@ -10,6 +10,7 @@ from typing import Any
 import torch
 
 import vusfa
+from vusfa.envs.dynamics import MAX_STEPS
 from vusfa.errors import ConfigError
 from vusfa.evaluation import get_metric, random_walk
 from vusfa.evaluation.baselines import RANDOM_WALK
@@ -54,7 +55,7 @@ class Options:
     goals_per_scene: int = 24
     seeds: int = 1
     walks: int = 3
-    max_steps: int = 500
+    max_steps: int = MAX_STEPS
     megabytes: float = 40.0
     command: str = ""
     tell: Callable[[str], None] = field(default=lambda line: None)

@@ -15,7 +15,7 @@ from tensordict import TensorDict
 from torch import Tensor
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from vusfa.envs.dynamics import start_history
+from vusfa.envs.dynamics import MAX_STEPS, start_history
 from vusfa.evaluation import trails
 from vusfa.evaluation.navigation import Observe
 from vusfa.modules import Agent, frozen
@@ -128,7 +128,7 @@ def principal_components(values: Tensor, count: int) -> tuple[Tensor, Tensor]:
 
 
 def sampled_walks(
-    agent: Agent, scenes: SceneSet, start: Tensor, goal: Tensor, max_steps: int = 500, seed: int = 0
+    agent: Agent, scenes: SceneSet, start: Tensor, goal: Tensor, max_steps: int = MAX_STEPS, seed: int = 0
 ) -> list[list[int]]:
     """An agent's ways with actions drawn from its policy, see :func:`vusfa.evaluation.trails`."""
     observe, history = make_observation(agent, scenes), agent.config["history"]

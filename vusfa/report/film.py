@@ -9,6 +9,7 @@ import torch
 from PIL import Image, ImageDraw, ImageFont
 from tensordict.nn import TensorDictModuleBase
 
+from vusfa.envs.dynamics import MAX_STEPS
 from vusfa.envs.rendering import draw_panels
 from vusfa.evaluation import Episodes, trails
 from vusfa.files import replacing
@@ -40,7 +41,7 @@ def record_walk(
     start: int,
     goal: int,
     *,
-    max_steps: int = 500,
+    max_steps: int = MAX_STEPS,
     history: int = 4,
     attempts: int = 10,
     seed: int = 0,

@@ -14,6 +14,7 @@ import numpy as np
 import pandas as pd
 import torch
 
+from vusfa.envs.dynamics import MAX_STEPS
 from vusfa.errors import ConfigError
 from vusfa.evaluation import Episodes
 from vusfa.evaluation.exact import ExactGoals
@@ -210,7 +211,7 @@ def _evaluation(folder: Path) -> tuple[Episodes | None, list[dict[str, Any]], st
             continue
         content = _read_json(summary)
         settings, rows = content.get("settings", {}), content.get("rows", [])
-        episodes = read_episodes(table, int(settings.get("max_steps", 500)))
+        episodes = read_episodes(table, int(settings.get("max_steps", MAX_STEPS)))
         own = rows[0]["policy"] if rows else ""
         others = [_with_nan(row) for row in rows if row["policy"] != own]
         variant = "sampled" if settings.get("sample", True) else "greedy"
