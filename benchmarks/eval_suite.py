@@ -11,7 +11,7 @@ from benchmarks.trainer import recipe_settings
 from vusfa.envs import resolve_goals
 from vusfa.evaluation import evaluate
 from vusfa.experiments.measure import evaluation_policy, evaluation_precision
-from vusfa.modules import ActingPolicy, make_agent
+from vusfa.modules import InferencePolicy, make_agent
 from vusfa.scenes import SceneSet
 
 __all__ = ["run"]
@@ -45,7 +45,7 @@ def _measure(name: str, scenes: SceneSet, history: int, size: int, options: Opti
         began = time.perf_counter()
         with evaluation_precision(agent, {"autocast": True}):
             evaluate(
-                evaluation_policy(agent, scenes) if together else ActingPolicy(agent),
+                evaluation_policy(agent, scenes) if together else InferencePolicy(agent),
                 scenes,
                 some,
                 episodes_per_goal=episodes,

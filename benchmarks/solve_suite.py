@@ -20,7 +20,7 @@ from benchmarks.report import Options, Report, Requirement, Row, number
 from benchmarks.trainer import running, small
 from vusfa.evaluation import evaluate
 from vusfa.evaluation.metrics import get_metric
-from vusfa.modules.presets import MODELS
+from vusfa.modules.config import MODELS
 from vusfa.scenes import SceneSet
 
 __all__ = ["PEERS", "Outcome", "checker", "is_solved", "run", "solve_row", "train_until"]

@@ -14,7 +14,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from vusfa.modules import Agent
-from vusfa.modules.presets import MODELS
+from vusfa.modules.config import MODELS
 
 __all__ = ["BareNetwork", "Goals", "Outputs", "Rows", "group"]
 
@@ -69,7 +69,7 @@ class BareNetwork:
     """One of the four models.
 
     Args:
-        agent: whose weights to copy; of ``preset=controlled``, reading ids.
+        agent: whose weights to copy; of ``architecture=controlled``, reading ids.
         half: compute products in bfloat16.
 
     Attributes:
@@ -78,8 +78,8 @@ class BareNetwork:
 
     def __init__(self, agent: Agent, half: bool = False) -> None:
         config: dict[str, Any] = agent.config
-        if config["preset"] != "controlled" or config["observation"] != "index":
-            raise ValueError("BareNetwork: give an agent of preset 'controlled' that reads ids")
+        if config["architecture"] != "controlled" or config["observation"] != "index":
+            raise ValueError("BareNetwork: give an agent of architecture 'controlled' that reads ids")
         self.ideas, self.config, self.half = MODELS[config["model"]], config, half
         self.params: Weights = {}
         self.num_scenes = agent.scene_layer.linear.num_scenes

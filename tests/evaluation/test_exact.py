@@ -9,8 +9,7 @@ from torch.nn.functional import one_hot
 
 from vusfa.evaluation import evaluate, get_metric
 from vusfa.evaluation.exact import exact_goals, expected_walks, uniform_probabilities
-from vusfa.evaluation.tabulated import TabulatedPolicy
-from vusfa.modules import ActingPolicy, Agent, make_agent
+from vusfa.modules import Agent, InferencePolicy, TabularPolicy, make_agent
 from vusfa.scenes import Scene, SceneSet
 from vusfa.scenes.markov import arrival_by_step
 
@@ -59,7 +58,7 @@ def test_a_corridor_by_hand() -> None:
 @pytest.mark.parametrize("greedy", [False, True])
 def test_beside_sampled_episodes(rooms: SceneSet, agent: Agent, greedy: bool) -> None:
     """Each mean of 400 episodes a goal lies within five of its standard errors of what is computed."""
-    table = TabulatedPolicy(agent, rooms)
+    table = TabularPolicy(agent, rooms)
 
     def likeliest(state: Tensor, goal: Tensor, scene: Tensor) -> Tensor:
         return one_hot(table.logits(state, goal).argmax(-1), 4).double()
@@ -67,7 +66,7 @@ def test_beside_sampled_episodes(rooms: SceneSet, agent: Agent, greedy: bool) ->
     probabilities = likeliest if greedy else table.probabilities
     exact = exact_goals(probabilities, rooms)
     sampled = evaluate(
-        ActingPolicy(agent), rooms, episodes_per_goal=400, max_steps=500, history=1, sample=not greedy
+        InferencePolicy(agent), rooms, episodes_per_goal=400, max_steps=500, history=1, sample=not greedy
     )
     assert exact.metrics["success_100"].min() < 1
     for row in range(len(exact.goal)):
@@ -79,7 +78,7 @@ def test_beside_sampled_episodes(rooms: SceneSet, agent: Agent, greedy: bool) ->
 
 
 def test_goals_are_computed_together_or_apart(rooms: SceneSet, agent: Agent) -> None:
-    policy = TabulatedPolicy(agent, rooms)
+    policy = TabularPolicy(agent, rooms)
     tables = [exact_goals(policy.probabilities, rooms, at_once=size) for size in (5, 64)]
     torch.testing.assert_close(tables[0].metrics["spl"], tables[1].metrics["spl"], atol=1e-5, rtol=1e-5)
     assert torch.equal(tables[0].goal, tables[1].goal)
@@ -103,7 +102,7 @@ def test_expected_walks_in_a_corridor_by_hand() -> None:
 
 
 def test_expected_walks_of_an_agent_beside_the_table_of_all_goals(rooms: SceneSet, agent: Agent) -> None:
-    chances = TabulatedPolicy(agent, rooms).probabilities
+    chances = TabularPolicy(agent, rooms).probabilities
     every = exact_goals(chances, rooms)
     goals = torch.tensor([2, 7, 18])
     rows = [int(((every.scene == scene) & (every.goal == goal)).nonzero()) for scene, goal in

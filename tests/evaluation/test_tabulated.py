@@ -5,8 +5,7 @@ import torch
 from tensordict import TensorDict
 
 from vusfa.evaluation import evaluate
-from vusfa.evaluation.tabulated import TabulatedPolicy
-from vusfa.modules import action_logits, make_agent
+from vusfa.modules import InferencePolicy, TabularPolicy, make_agent
 from vusfa.scenes import SceneSet
 
 
@@ -14,13 +13,13 @@ from vusfa.scenes import SceneSet
 def test_the_same_logits_as_the_agents(rooms: SceneSet, model: str) -> None:
     torch.manual_seed(0)
     agent = make_agent(model, scenes=rooms, history=1, hidden_size=8, embedding_size=8).train()
-    table = TabulatedPolicy(agent, rooms, at_once=40)  # several goals of a scene, several times
+    table = TabularPolicy(agent, rooms, at_once=40)  # several goals of a scene, several times
     assert agent.training
     agent.eval()
     scene = torch.tensor([0] * 9 + [1] * 9)
     state = rooms.offsets[scene] + torch.arange(18) % 16
     goal = rooms.offsets[scene] + torch.arange(18) * 7 % 16
-    expected = action_logits(agent, state.unsqueeze(-1), goal, scene).softmax(-1)
+    expected = InferencePolicy(agent).logits(state.unsqueeze(-1), goal, scene).softmax(-1)
     torch.testing.assert_close(table.probabilities(state, goal, scene), expected.detach())
 
 
@@ -28,7 +27,7 @@ def test_a_table_of_some_goals_alone(rooms: SceneSet) -> None:
     torch.manual_seed(0)
     agent = make_agent("vusfa", scenes=rooms, history=1, hidden_size=8, embedding_size=8)
     goals = torch.tensor([20, 3])
-    every, some = TabulatedPolicy(agent, rooms), TabulatedPolicy(agent, rooms, goals)
+    every, some = TabularPolicy(agent, rooms), TabularPolicy(agent, rooms, goals)
     for goal, scene in ((3, 0), (20, 1)):
         state = torch.arange(*rooms.offsets[scene : scene + 2].tolist())
         to = torch.full_like(state, goal)
@@ -44,7 +43,7 @@ def test_the_same_walks_as_the_actors(rooms: SceneSet, sample: bool) -> None:
     with torch.no_grad():
         for parameter in agent.policy.parameters():
             parameter.mul_(5.0)
-    policies = agent.get_policy_operator(out_keys=["action"]), TabulatedPolicy(agent, rooms)
+    policies = agent.get_policy_operator(out_keys=["action"]), TabularPolicy(agent, rooms)
     one, two = (
         evaluate(policy, rooms, episodes_per_goal=3, max_steps=40, history=1, sample=sample, batch_size=17)
         for policy in policies
@@ -56,7 +55,7 @@ def test_the_same_walks_as_the_actors(rooms: SceneSet, sample: bool) -> None:
 def test_more_than_one_frame_is_no_table(rooms: SceneSet) -> None:
     agent = make_agent("gvf", scenes=rooms, history=2, hidden_size=8, embedding_size=8)
     with pytest.raises(ValueError, match="history=2"):
-        TabulatedPolicy(agent, rooms)
+        TabularPolicy(agent, rooms)
 
 
 def test_walks_do_not_read_the_latent(rooms: SceneSet) -> None:

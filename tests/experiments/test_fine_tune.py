@@ -12,7 +12,7 @@ from vusfa.cli.launch import compose
 from vusfa.conf import FOLDER as CONF
 from vusfa.evaluation import evaluate, get_metric
 from vusfa.experiments.fine_tune import fine_tune, fine_tuning_settings
-from vusfa.modules import ActingPolicy
+from vusfa.modules import InferencePolicy
 from vusfa.scenes import SceneSet
 from vusfa.training import load_agent, make_trainer
 
@@ -109,7 +109,7 @@ def test_what_is_computed_beside_what_is_walked(config: dict[str, Any], checkpoi
     agent, scenes, state = load_agent(checkpoint)
     goals = torch.tensor([5, 6, 14])
     curve = fine_tune(state, fine_tuning_settings(config, goals, 1, seed=4), scenes, every=1000)
-    table = evaluate(ActingPolicy(agent), scenes, goals, episodes_per_goal=3000, max_steps=20, history=1)
+    table = evaluate(InferencePolicy(agent), scenes, goals, episodes_per_goal=3000, max_steps=20, history=1)
     length = table.length.double()
     assert curve["length"][0] == pytest.approx(length.mean().item(), abs=5 * 8 / 9000**0.5)
     assert curve["success"][0] == pytest.approx(table.success.double().mean().item(), abs=5 * 0.5 / 9000**0.5)

@@ -9,7 +9,7 @@ from vusfa.envs import resolve_goals
 from vusfa.errors import ResultError
 from vusfa.evaluation import evaluate
 from vusfa.experiments.manifest import make_manifest, read_manifest, write_manifest
-from vusfa.modules import ActingPolicy, make_agent
+from vusfa.modules import InferencePolicy, make_agent
 from vusfa.scenes import SceneSet
 
 
@@ -55,6 +55,6 @@ def test_evaluate_walks_its_episodes_and_no_others() -> None:
     manifest = make_manifest(rooms, torch.tensor([2]), episodes_per_goal=1)
     start, goal = manifest.episodes(rooms)
     agent = make_agent("gvf", scenes=rooms, history=1, hidden_size=8, embedding_size=8)
-    table = evaluate(ActingPolicy(agent), rooms, episodes=(start, goal), max_steps=5, history=1)
+    table = evaluate(InferencePolicy(agent), rooms, episodes=(start, goal), max_steps=5, history=1)
     assert torch.equal(table.start, start)
     assert torch.equal(table.goal, goal)

@@ -48,10 +48,12 @@ def filmed(tmp_path_factory: pytest.TempPathFactory) -> SceneSet:
 def small_agent(scenes: SceneSet) -> Callable[..., Agent]:
     """``make_agent`` in these rooms with layers of 16, from a fixed seed."""
 
-    def make(model: str = "vusfa", preset: str = "controlled", seed: int = 0, **overrides: Any) -> Agent:
+    def make(
+        model: str = "vusfa", architecture: str = "controlled", seed: int = 0, **overrides: Any
+    ) -> Agent:
         with torch.random.fork_rng():
             torch.manual_seed(seed)
-            return make_agent(model, preset, overrides.pop("scenes", scenes), **{**SMALL, **overrides})
+            return make_agent(model, architecture, overrides.pop("scenes", scenes), **{**SMALL, **overrides})
 
     return make
 

@@ -28,7 +28,7 @@ def test_pretraining_explains_most_of_what_was_seen(rooms: SceneSet, history: in
     agent = make_agent("usfa", scenes=rooms, pretrained="autoencoder", **sizes)
     before = pretrain_autoencoder(agent, steps=0)
     after = pretrain_autoencoder(agent, steps=300)
-    features = agent.encoder.encoder.frames.lookup(None)
+    features = agent.encoder.frames.lookup(None)
     centred = features - features.mean(0)
     best = torch.linalg.svdvals(centred).square()
     linear = (best[:32].sum() / best.sum()).item()
@@ -61,7 +61,7 @@ def test_the_same_seed_makes_the_same_encoder(rooms: SceneSet) -> None:
         ({"model": "vusfa"}, "no Gaussian"),
         ({"model": "usfa", "shared_encoder": False}, "one code for states and goals"),
         ({"model": "usfa", "observation": "pixels"}, "reconstructs the scenes' features"),
-        ({"model": "usfa", "preset": "paper"}, "pretrained is no part of preset 'paper'"),
+        ({"model": "usfa", "architecture": "paper"}, "pretrained is no part of architecture 'paper'"),
     ],
 )
 def test_what_cannot_be_pretrained(rooms: SceneSet, settings: dict, message: str) -> None:

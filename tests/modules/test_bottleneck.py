@@ -5,23 +5,26 @@ import torch
 from tensordict import TensorDict
 
 from vusfa.errors import ConfigError
-from vusfa.modules import FeatureFrames, GaussianEncoder, LatentSampler, SiameseEncoder, make_agent
-from vusfa.modules.normalised import NormalisedEncoder
+from vusfa.modules import FeatureFrames, GaussianBottleneck, LatentSampler, SiameseEncoder, make_agent
 from vusfa.modules.trunk import Fusion, SiameseTrunk
 from vusfa.scenes import SceneSet
 
 
-def gaussian(scenes: SceneSet, **options: object) -> GaussianEncoder:
+def gaussian(scenes: SceneSet, normalize: bool = False, **options: object) -> SiameseEncoder:
     torch.manual_seed(0)
-    return GaussianEncoder(SiameseEncoder(FeatureFrames(scenes.features), 4, 16, 2 * 8), **options)
+    bottleneck = GaussianBottleneck(**options)
+    frames = FeatureFrames(scenes.features)
+    return SiameseEncoder(frames, 4, 16, 8, bottleneck=bottleneck, normalize=normalize)
 
 
-class TestGaussianEncoder:
+class TestGaussianBottleneck:
     def test_means_are_the_embeddings(self, scenes: SceneSet) -> None:
         module = gaussian(scenes)
         inputs = torch.randint(21, (3, 4)), torch.randint(21, (3,))
         state, goal, state_loc, state_scale, state_kl, goal_loc, goal_scale, goal_kl = module(*inputs)
-        state_code, goal_code = module.encoder(*inputs)
+        states, goals = module.first_layer(*inputs)
+        state_code = module.branch.finish(states.values)
+        goal_code = module.branch.finish(goals.values)[goals.index]
         assert torch.equal(state, state_loc)
         assert torch.equal(goal, goal_loc)
         for kl, loc, scale in ((state_kl, state_loc, state_scale), (goal_kl, goal_loc, goal_scale)):
@@ -49,19 +52,17 @@ class TestGaussianEncoder:
     def test_what_is_made_of_the_means_needs_no_scales(
         self, scenes: SceneSet, monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        module = gaussian(scenes)
-        trunk = SiameseTrunk(NormalisedEncoder(module), Fusion(8, 12))
+        trunk = SiameseTrunk(gaussian(scenes, normalize=True), Fusion(8, 12))
         inputs = torch.randint(21, (30, 4)), torch.randint(21, (30,))
         wanted = trunk(*inputs)[-1]
         halves: list[bool] = []
-        finish = module.encoder.branch.finish
+        branch = trunk.encoder.branch
+        finish = branch.finish
         monkeypatch.setattr(
-            module.encoder.branch,
-            "finish",
-            lambda *given, half=False: halves.append(half) or finish(*given, half=half),
+            branch, "finish", lambda *given, half=False: halves.append(half) or finish(*given, half=half)
         )
         torch.testing.assert_close(trunk.fused(*inputs), wanted)
-        assert halves == [True, False]  # of states, row by row; goals are few
+        assert halves == [True, True]
         trunk(*inputs)
         assert halves[2:] == [False, False]
 

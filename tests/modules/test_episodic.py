@@ -6,7 +6,7 @@ from tensordict import TensorDict
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from vusfa.evaluation import evaluate
-from vusfa.modules import ActingPolicy, Agent, TriedActions, action_logits, make_agent
+from vusfa.modules import Agent, InferencePolicy, TriedActions, make_agent
 from vusfa.scenes import SceneSet
 
 
@@ -29,7 +29,7 @@ def rows(state: list[int], tried: torch.Tensor | None = None, first: bool = Fals
 
 
 def test_the_likeliest_action_by_hand(agent: Agent) -> None:
-    logits = action_logits(agent, torch.tensor([[3]]), torch.tensor([7]), torch.zeros(1).long())[0]
+    logits = InferencePolicy(agent).logits(torch.tensor([[3]]), torch.tensor([7]), torch.zeros(1).long())[0]
     counts = torch.tensor([4, 0, 1, 2], dtype=torch.uint8)
     tried = torch.zeros(1, 176, 4, dtype=torch.uint8)
     tried[0, 3], tried[0, 4, 1] = counts, 9  # of another state: not looked at
@@ -56,7 +56,7 @@ def test_counts_do_not_overflow(agent: Agent) -> None:
 def test_without_weight_it_is_the_agent(rooms: SceneSet, agent: Agent) -> None:
     tables = [
         evaluate(policy, rooms, [7, 9], episodes_per_goal=20, max_steps=40, history=1)
-        for policy in (ActingPolicy(agent), TriedActions(agent, 176, 4, weight=0.0))
+        for policy in (InferencePolicy(agent), TriedActions(agent, 176, 4, weight=0.0))
     ]
     assert abs(tables[0].length.double().mean() - tables[1].length.double().mean()) < 6
 

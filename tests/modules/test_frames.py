@@ -21,23 +21,23 @@ class TestFeatureFrames:
         assert not list(frames.parameters())
         assert FeatureFrames(scenes.features, lookup=False).num_states == 0
 
-    def test_normalised_over_the_states(self, scenes: SceneSet) -> None:
-        frames = FeatureFrames(scenes.features, normalise=True)
+    def test_normalized_over_the_states(self, scenes: SceneSet) -> None:
+        frames = FeatureFrames(scenes.features, normalize=True)
         table = frames.lookup(None)
         torch.testing.assert_close(table.mean(0), torch.zeros(12), atol=1e-5, rtol=0)
         torch.testing.assert_close(table.std(0, correction=0), torch.ones(12))
         torch.testing.assert_close(frames.encode(scenes.features[:, 0]), table)
 
     def test_statistics_travel_with_the_weights(self, scenes: SceneSet) -> None:
-        """An agent loaded with other scenes must normalise by the numbers it was trained with."""
-        trained = FeatureFrames(scenes.features, normalise=True)
-        loaded = FeatureFrames(scenes.features * 3 + 1, normalise=True)
+        """An agent loaded with other scenes must normalize by the numbers it was trained with."""
+        trained = FeatureFrames(scenes.features, normalize=True)
+        loaded = FeatureFrames(scenes.features * 3 + 1, normalize=True)
         loaded.load_state_dict(trained.state_dict())
         torch.testing.assert_close(loaded.encode(scenes.features[:, 0]), trained.lookup(None))
 
     def test_autocast_gets_the_table_converted_once(self, scenes: SceneSet) -> None:
-        frames = FeatureFrames(scenes.features, normalise=True)
-        other = FeatureFrames(scenes.features * 3 + 1, normalise=True)
+        frames = FeatureFrames(scenes.features, normalize=True)
+        other = FeatureFrames(scenes.features * 3 + 1, normalize=True)
         with torch.autocast("cpu", torch.bfloat16):
             table = frames.lookup(None)
             assert torch.equal(table, frames.table.bfloat16())
@@ -52,7 +52,7 @@ class TestFeatureFrames:
     def test_a_constant_feature_becomes_nothing(self) -> None:
         features = torch.rand(5, 1, 3)
         features[..., 1] = 0.7
-        table = FeatureFrames(features, normalise=True).lookup(None)
+        table = FeatureFrames(features, normalize=True).lookup(None)
         assert table.isfinite().all()
         assert table[:, 1].abs().max() < 1e-3
 

@@ -74,7 +74,7 @@ class TestSuccessorPolicy:
 
     def test_no_gradient_reaches_psi_but_hidden_has_one(self) -> None:
         hidden, psi = torch.randn(5, 8, requires_grad=True), torch.randn(5, 6, requires_grad=True)
-        for norm in (None, "rms", "layer"):
+        for norm in (None, "layer"):
             hidden.grad = None
             self.head(successor_norm=norm)(hidden, psi, torch.randint(2, (5,))).square().sum().backward()
             assert psi.grad is None
@@ -84,12 +84,9 @@ class TestSuccessorPolicy:
         head, hidden, scene_id = self.head(), torch.randn(5, 8), torch.zeros(5, dtype=torch.int64)
         assert (head(hidden, torch.zeros(5, 6), scene_id) - head(hidden, torch.ones(5, 6), scene_id)).any()
 
-    def test_normalised_psi_has_no_scale(self) -> None:
+    def test_normalized_psi_has_no_scale(self) -> None:
         hidden, psi, scene_id = torch.randn(5, 8), torch.randn(5, 6), torch.zeros(5, dtype=torch.int64)
-        rms, layer = self.head(successor_norm="rms"), self.head(successor_norm="layer")
-        torch.testing.assert_close(
-            rms(hidden, 50 * psi, scene_id), rms(hidden, psi, scene_id), rtol=1e-4, atol=1e-5
-        )
+        layer = self.head(successor_norm="layer")
         torch.testing.assert_close(
             layer(hidden, 50 * psi + 7, scene_id), layer(hidden, psi, scene_id), rtol=1e-4, atol=1e-5
         )
@@ -98,12 +95,12 @@ class TestSuccessorPolicy:
         ).abs().max() > 0.1
 
     def test_by_hand(self) -> None:
-        """psi = (3, 4) has root mean square 5 / sqrt 2."""
-        head = SuccessorPolicyHead(1, 1, 2, 1, successor_norm="rms", successor_gain=10.0)
+        """psi = (1, 7) has mean 4 and deviation 3."""
+        head = SuccessorPolicyHead(1, 1, 2, 1, successor_norm="layer")
         seen: list[torch.Tensor] = []
         head.first.register_forward_pre_hook(lambda _, inputs: seen.append(inputs[0]))
-        head(torch.tensor([7.0]), torch.tensor([3.0, 4.0]), torch.tensor(0))
-        torch.testing.assert_close(seen[0], torch.tensor([7.0, 30 * 2**0.5 / 5, 40 * 2**0.5 / 5]))
+        head(torch.tensor([7.0]), torch.tensor([1.0, 7.0]), torch.tensor(0))
+        torch.testing.assert_close(seen[0], torch.tensor([7.0, -1.0, 1.0]))
 
     def test_rectified_logits(self) -> None:
         inputs = torch.randn(50, 8), torch.randn(50, 6), torch.randint(2, (50,))
@@ -118,5 +115,5 @@ class TestSuccessorPolicy:
     def test_half_precision(self) -> None:
         inputs = torch.randn(5, 8), torch.randn(5, 6), torch.randint(2, (5,))
         with torch.autocast("cpu", torch.bfloat16):
-            logits = self.head(successor_norm="rms")(*inputs)
+            logits = self.head(successor_norm="layer")(*inputs)
         assert logits.dtype == torch.float32

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from torch.utils.flop_counter import FlopCounterMode
 
 from vusfa.modules import HistoryLinear, SceneLinear, linear
-from vusfa.modules.rows import SceneBlocks, SceneRows
+from vusfa.modules.rows import SceneBlocks, SortedByScene
 
 
 def by_rows(layer: SceneLinear, x: torch.Tensor, scene_id: torch.Tensor) -> torch.Tensor:
@@ -32,13 +32,13 @@ class TestSceneLinear:
     def test_sorted_rows_that_are_counted(self, scene_id: list[int], wide: bool) -> None:
         layer = SceneLinear(4, 5, 40 if wide else 4)
         x, scene = torch.randn(len(scene_id), 5), torch.tensor(sorted(scene_id))
-        rows = SceneRows(scene, [scene_id.count(number) for number in range(4)])
+        rows = SortedByScene(scene, [scene_id.count(number) for number in range(4)])
         torch.testing.assert_close(layer(x, rows), by_rows(layer, x, scene))
 
     @given(scene_id=st.lists(st.integers(0, 3), min_size=1, max_size=40))
     def test_rows_in_blocks(self, scene_id: list[int]) -> None:
         layer, scene = SceneLinear(4, 5, 7), torch.tensor(scene_id)
-        x, blocks = torch.randn(len(scene_id), 5), SceneBlocks.of(*SceneRows.sort(scene, 4))
+        x, blocks = torch.randn(len(scene_id), 5), SceneBlocks.of(*SortedByScene.sort(scene, 4))
         most = max(scene_id.count(number) for number in range(4))
         assert (blocks is None) == (4 * most > 1.5 * len(scene_id))
         if blocks is not None:

@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-from contextlib import nullcontext
 from typing import Any
 
 import pytest
@@ -9,8 +8,9 @@ from torch import Tensor
 from torch.utils.flop_counter import FlopCounterMode
 
 from vusfa.errors import ConfigError
-from vusfa.modules import FeatureFrames, NormalisedEncoder, SiameseEncoder, frozen
+from vusfa.modules import FeatureFrames, Fusion, SiameseEncoder
 from vusfa.modules.siamese import Branch
+from vusfa.modules.trunk import CachedTrunk, SiameseTrunk
 from vusfa.scenes import SceneSet
 
 QUIRKS: list[dict[str, Any]] = [{}, {"shared": False}, {"state_layer": True}, {"out_features": None}]
@@ -33,6 +33,15 @@ def features(scenes: SceneSet, state: Tensor, goal: Tensor) -> tuple[Tensor, Ten
     return scenes.features[state, 0], scenes.features[goal, 0]
 
 
+def observed(module: SiameseEncoder, state: Tensor, goal: Tensor) -> tuple[Tensor, ...]:
+    """Codes of observations."""
+    module.by_id = False
+    try:
+        return module(state, goal)
+    finally:
+        module.by_id = True
+
+
 class TestByIds:
     """Whatever way a batch takes, it gives what encoding every frame of every row gives."""
 
@@ -47,8 +56,8 @@ class TestByIds:
         state_id, goal_id = ids(scenes, *batch, history=history)
         outcomes = []
         for codes in (
-            module.from_ids(state_id, goal_id),
-            module.from_observations(*features(scenes, state_id, goal_id)),
+            module(state_id, goal_id),
+            observed(module, *features(scenes, state_id, goal_id)),
         ):
             state, goal = codes
             assert state.shape == goal.shape == (*batch, 16 if quirk.get("out_features", 8) is None else 8)
@@ -61,8 +70,8 @@ class TestByIds:
         """Eight rows over three states: less than the world, but fewer distinct frames than rows."""
         module = encoder(scenes)
         state_id, goal_id = torch.randint(3, (8, 4)) + 9, torch.randint(3, (8,)) + 9
-        direct = module.from_observations(*features(scenes, state_id, goal_id))
-        torch.testing.assert_close(module.from_ids(state_id, goal_id), direct)
+        direct = observed(module, *features(scenes, state_id, goal_id))
+        torch.testing.assert_close(module(state_id, goal_id), direct)
 
     @pytest.mark.parametrize("history", [1, 4])
     @pytest.mark.parametrize("rows", [5, 60])
@@ -70,7 +79,7 @@ class TestByIds:
         """bfloat16 has 8 bits: both ways stay within a few of its steps of the exact codes, in float32."""
         module = encoder(scenes, history)
         state_id, goal_id = ids(scenes, rows, history=history)
-        exact = module.from_observations(*features(scenes, state_id, goal_id))
+        exact = observed(module, *features(scenes, state_id, goal_id))
         with torch.autocast("cpu", torch.bfloat16):
             by_id = module(state_id, goal_id)
             module.by_id = False
@@ -102,7 +111,7 @@ class TestByIds:
         state_id, goal_id = ids(scenes, 6, history=5)
         torch.testing.assert_close(module(state_id, goal_id), module(state_id[:, -2:], goal_id))
         observation, goal = features(scenes, state_id, goal_id)
-        torch.testing.assert_close(module.from_observations(observation, goal), module(state_id, goal_id))
+        torch.testing.assert_close(observed(module, observation, goal), module(state_id, goal_id))
 
     def test_a_shorter_history_is_an_error(self, scenes: SceneSet) -> None:
         module = encoder(scenes, 4)
@@ -110,7 +119,7 @@ class TestByIds:
         with pytest.raises(ConfigError, match="state_id has 3 frames a row and the agent reads 4"):
             module(state_id, goal_id)
         with pytest.raises(ConfigError, match="observation has 3 frames"):
-            module.from_observations(*features(scenes, state_id, goal_id))
+            observed(module, *features(scenes, state_id, goal_id))
 
     def test_a_goal_may_be_several_frames(self, scenes: SceneSet) -> None:
         module = encoder(scenes)
@@ -118,7 +127,7 @@ class TestByIds:
         observation, goal = features(scenes, state_id, goal_id)
         repeated = goal.unsqueeze(-2).expand(6, 4, 12)
         torch.testing.assert_close(
-            module.from_observations(observation, repeated), module.from_observations(observation, goal)
+            observed(module, observation, repeated), observed(module, observation, goal)
         )
 
 
@@ -191,103 +200,58 @@ class TestCost:
         assert self.flops(module, state_id, goal_id) == (2 * 4 + 1) * self.FIRST
 
 
-def test_normalised_embeddings(scenes: SceneSet) -> None:
+def test_normalized_embeddings() -> None:
     """Of (2, 4, 6, 8), mean 5 and deviation sqrt 5, each becomes (x - 5) / sqrt 5; whatever the scale."""
-    wanted = torch.tensor([-3.0, -1.0, 1.0, 3.0]) / 5**0.5
-    given = torch.tensor([2.0, 4.0, 6.0, 8.0])
-
-    class Encoder:
-        def both(
-            self, state: torch.Tensor, goal: torch.Tensor, heads: Any, part: int | None
-        ) -> tuple[Any, Any]:
-            return heads[0](state), heads[1](goal)
-
-    state, goal = NormalisedEncoder(Encoder())(given, 100 * given)
+    wanted = torch.tensor([[-3.0, -1.0, 1.0, 3.0]]) / 5**0.5
+    frames = FeatureFrames(torch.tensor([[2.0, 4.0, 6.0, 8.0], [200.0, 400.0, 600.0, 800.0]]).unsqueeze(1))
+    module = SiameseEncoder(frames, 1, 4, None, normalize=True)
+    with torch.no_grad():
+        module.branch.first.weight.copy_(torch.eye(4))
+        module.branch.first.bias.zero_()
+    state, goal = module(torch.tensor([[0]]), torch.tensor([1]))
     torch.testing.assert_close(state, wanted)
     torch.testing.assert_close(goal, wanted)
 
 
-class TestFrozen:
+class TestCached:
+    def trunk(self, scenes: SceneSet, history: int, quirk: dict[str, Any]) -> SiameseTrunk:
+        size = 16 if quirk.get("out_features", 8) is None else 8
+        return SiameseTrunk(encoder(scenes, history, **quirk), Fusion(size, 10))
+
     @pytest.mark.parametrize("history", [1, 4])
     @pytest.mark.parametrize("quirk", QUIRKS, ids=str)
-    def test_same_codes(self, scenes: SceneSet, history: int, quirk: dict[str, Any]) -> None:
-        module = encoder(scenes, history, **quirk)
-        inputs = ids(scenes, 2, 5, history=history)
-        wanted = module(*inputs)
-        with frozen(torch.nn.Sequential(module)), torch.no_grad():
-            torch.testing.assert_close(module(*inputs), wanted)
+    def test_same_fusion(self, scenes: SceneSet, history: int, quirk: dict[str, Any]) -> None:
+        trunk = self.trunk(scenes, history, quirk)
+        inputs = ids(scenes, 30, history=history)
+        wanted = trunk(*inputs)[-1]
+        torch.testing.assert_close(trunk.fused(*inputs), wanted)
+        torch.testing.assert_close(CachedTrunk(trunk).fused(*inputs), wanted)
 
     def test_nothing_is_multiplied_twice(self, scenes: SceneSet) -> None:
-        module = encoder(scenes, 1)
-        with frozen(module), FlopCounterMode(display=False) as counter, torch.no_grad():
-            before = counter.get_total_flops()
-            module(*ids(scenes, 5, history=1))
-            assert counter.get_total_flops() == before
-
-    def test_thaws_even_after_an_error(self, scenes: SceneSet) -> None:
-        module = encoder(scenes)
-        inputs = ids(scenes, 5)
-        with pytest.raises(KeyError), frozen(module):
-            raise KeyError
-        with torch.no_grad():
-            before = module(*inputs)[1]
-            module.branch.last.bias.add_(1.0)
-            torch.testing.assert_close(module(*inputs)[1], before + 1.0)
-
-    def test_gradients_are_of_the_weights_as_they_are(self, scenes: SceneSet) -> None:
-        module = encoder(scenes)
-        with frozen(module):
-            module(*ids(scenes, 5))[0].sum().backward()
-        assert all(parameter.grad.any() for parameter in module.parameters())
-
-    @pytest.mark.parametrize("history", [1, 4])
-    def test_gradients_through_what_is_looked_up(self, scenes: SceneSet, history: int) -> None:
-        """Encoded once with gradients, collected with and differentiated: the gradients of encoding anew."""
-        module, inputs = encoder(scenes, history), ids(scenes, 2, 5, history=history)
-        gradients = []
-        for grad in (False, True):
-            module.zero_grad()
-            with frozen(module, grad=grad):
-                with torch.no_grad():
-                    module(*inputs)
-                with FlopCounterMode(display=False) as counter:
-                    state, goal = module(*inputs)
-                (state.square().sum() + goal.sum()).backward()
-            gradients.append([parameter.grad.clone() for parameter in module.parameters()])
-        torch.testing.assert_close(gradients[0], gradients[1], atol=1e-4, rtol=1e-4)
-        if history == 1:
-            assert counter.get_total_flops() == 0
+        cached = CachedTrunk(self.trunk(scenes, 1, {}))
+        with FlopCounterMode(display=False) as counter:
+            cached.fused(*ids(scenes, 5, history=1))
+        assert counter.get_total_flops() == 0
 
     @pytest.mark.parametrize("history", [1, 4])
     @pytest.mark.parametrize("quirk", QUIRKS, ids=str)
     def test_only_the_goals_that_there_are(
         self, scenes: SceneSet, history: int, quirk: dict[str, Any]
     ) -> None:
-        module = encoder(scenes, history, **quirk)
-        states, _ = ids(scenes, 2, 5, history=history)
+        trunk = self.trunk(scenes, history, quirk)
+        states, _ = ids(scenes, 10, history=history)
         goals = torch.tensor([7, 2, 11])
-        chosen = goals[torch.randint(3, (2, 5))]
-        wanted = module(states, chosen)
-        with frozen(module, goals=goals), torch.no_grad():
-            torch.testing.assert_close(module(states, chosen), wanted)
-            with pytest.raises(IndexError):
-                module(states, torch.full((2, 5), 3))
+        chosen = goals[torch.randint(3, (10,))]
+        cached = CachedTrunk(trunk, goals)
+        torch.testing.assert_close(cached.fused(states, chosen), trunk.fused(states, chosen))
+        with pytest.raises(IndexError):
+            cached.fused(states, torch.full((10,), 3))
 
     @pytest.mark.parametrize("history", [1, 4])
-    def test_one_part_of_what_the_heads_return(self, scenes: SceneSet, history: int) -> None:
-        def head(code: torch.Tensor) -> tuple[torch.Tensor, ...]:
-            return code + 1, code * 2
-
-        module, inputs = encoder(scenes, history), ids(scenes, 60, history=history)
-        for some in (inputs, tuple(part[:3] for part in inputs)):
-            for context in (nullcontext(), frozen(module)):
-                with context, torch.no_grad():
-                    state, goal = module(*some)
-                    twice = module.both(*some, (head, head), 1)
-                torch.testing.assert_close(twice, (2 * state, 2 * goal))
-
-    def test_an_agent_fed_features_has_nothing_to_freeze(self, scenes: SceneSet) -> None:
-        module = SiameseEncoder(FeatureFrames(scenes.features, lookup=False), 4, 16, 8, by_id=False)
-        inputs = features(scenes, *ids(scenes, 5))
-        with frozen(module), torch.no_grad():
-            torch.testing.assert_close(module(*inputs), module.from_observations(*inputs))
+    def test_half_precision(self, scenes: SceneSet, history: int) -> None:
+        trunk, inputs = self.trunk(scenes, history, {}), ids(scenes, 30, history=history)
+        with torch.no_grad(), torch.autocast("cpu", torch.bfloat16):
+            cached = CachedTrunk(trunk)
+            assert cached.trunk.fusion.linear.weight.dtype == torch.bfloat16
+            torch.testing.assert_close(cached.fused(*inputs), trunk.fused(*inputs), atol=0.02, rtol=0.02)
+        assert trunk.fusion.linear.weight.dtype == torch.float32

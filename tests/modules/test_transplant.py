@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from vusfa.errors import ConfigError
-from vusfa.modules import MODELS, ActingPolicy, action_logits, make_agent, transplant
+from vusfa.modules import MODELS, InferencePolicy, make_agent, transplant
 from vusfa.scenes import Scene, SceneSet
 
 SMALL = {"history": 1, "hidden_size": 8, "embedding_size": 8}
@@ -23,12 +23,12 @@ def test_equal_pictures_give_equal_numbers_in_whichever_scene(model: str, rooms:
     agent = make_agent(model, scenes=rooms, shared_heads=True, **SMALL)
     alone = transplant(agent, SceneSet([rooms.scenes[1]]))
     state, goal = torch.arange(12).unsqueeze(-1), torch.arange(12).flip(0)
-    there = action_logits(agent, state + 16, goal + 16, torch.ones(12).long())
-    torch.testing.assert_close(action_logits(alone, state, goal, torch.zeros(12).long()), there)
+    there = InferencePolicy(agent).logits(state + 16, goal + 16, torch.ones(12).long())
+    torch.testing.assert_close(InferencePolicy(alone).logits(state, goal, torch.zeros(12).long()), there)
     with torch.no_grad():
         next(alone.parameters()).add_(1.0)
     torch.testing.assert_close(
-        action_logits(agent, state + 16, goal + 16, torch.ones(12).long()), there
+        InferencePolicy(agent).logits(state + 16, goal + 16, torch.ones(12).long()), there
     )  # a copy
 
 
@@ -36,7 +36,7 @@ def test_heads_are_one_for_all(rooms: SceneSet) -> None:
     one, each = (make_agent("vusfa", scenes=rooms, shared_heads=flag, **SMALL) for flag in (True, False))
     assert one.scene_layer.linear.weight.shape == (1, 8, 8)
     assert each.scene_layer.linear.weight.shape == (2, 8, 8)
-    assert ActingPolicy(one)._num_scenes == 1
+    assert one.num_scenes == 1
 
 
 def test_what_does_not_fit(rooms: SceneSet, make_scene: Callable[..., Scene]) -> None:

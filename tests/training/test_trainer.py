@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -11,8 +12,10 @@ import torch
 from omegaconf import OmegaConf
 
 from vusfa.cli.launch import compose
+import vusfa.modules.inference
 from vusfa.conf import FOLDER as CONF
 from vusfa.errors import ConfigError, VusfaError
+from vusfa.modules import TabularPolicy
 from vusfa.training import Trainer, make_trainer
 
 SMALL = [
@@ -118,19 +121,31 @@ def test_regression_of_the_reward_needs_reward_weights(scene_file: Path):
         (["collector.rollout=100"], True),
         (["collector.rollout=1"], False),  # more pairs than three a frame
         (["collector.rollout=100", "agent.history=4"], False),
-        (["collector.rollout=100", *HINDSIGHT], False),
     ],
 )
-def test_where_answers_are_written_down(scene_file: Path, overrides: list[str], tabulated: bool):
-    assert (made(scene_file, *overrides).pairs is not None) == tabulated
+def test_where_answers_are_tabulated(
+    scene_file: Path, overrides: list[str], tabulated: bool, monkeypatch: pytest.MonkeyPatch
+):
+    tables = []
+
+    class Counted(TabularPolicy):
+        def __init__(self, *args: Any) -> None:
+            super().__init__(*args)
+            tables.append(self)
+
+    monkeypatch.setattr(vusfa.modules.inference, "TabularPolicy", Counted)
+    trainer = made(scene_file, *overrides)
+    with trainer.collecting() as batches:
+        trainer.collect(batches)
+    assert bool(tables) == tabulated
 
 
-def test_written_down_or_not_the_same_is_learned(scene_file: Path):
+def test_tabulated_or_not_the_same_is_learned(scene_file: Path):
     weights = []
-    for pairs in (True, False):
+    for cached in (True, False):
         trainer = made(scene_file, "autocast=false", "collector.rollout=100")
-        if not pairs:
-            trainer.pairs = None
+        if not cached:
+            trainer.acting.cached = lambda *_: nullcontext()
         with trainer.collecting() as batches:
             for _ in range(3):
                 trainer.update(batches)

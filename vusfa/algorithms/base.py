@@ -54,13 +54,11 @@ class Algorithm:
 
     Attributes:
         replay_steps: further optimizer steps per batch.
-        relabels_goals: whether its losses name other goals than those trained on.
     """
 
     #: Class of its settings; Hydra's ConfigStore gets it under the registered name.
     Settings: ClassVar[type[AlgorithmSettings]] = AlgorithmSettings
     replay_steps: int = 0
-    relabels_goals: bool = False
 
     def __init__(self, agent: Agent, scenes: SceneSet, settings: Mapping[str, Any]) -> None:
         self.agent, self.scenes, self.settings = agent, scenes, settings

@@ -32,8 +32,6 @@ class Hindsight(USF):
         hindsight_loss: of a sample.
     """
 
-    relabels_goals = True
-
     def __init__(self, agent: Agent, scenes: SceneSet, settings: Mapping[str, Any]) -> None:
         super().__init__(agent, scenes, settings)
         numbers, task, collector = dict(settings["hindsight"]), settings["env"], settings["collector"]

@@ -34,7 +34,7 @@ from vusfa.conf import FOLDER
 from vusfa.conf import compose as conf_compose
 from vusfa.conf.schema import check_overrides, mistake, near, register_schema, validated
 from vusfa.errors import VusfaError
-from vusfa.modules.presets import resolve_config
+from vusfa.modules.config import resolve_config
 
 __all__ = ["compose", "launch"]
 

@@ -8,7 +8,7 @@ they weigh, not a full batch a step.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from typing import Any
 
 import torch
@@ -22,7 +22,7 @@ from vusfa.envs.goals import resolve_goals
 from vusfa.errors import ConfigError
 from vusfa.evaluation.episodes import Episodes
 from vusfa.evaluation.starts import Unreachable, episode_starts
-from vusfa.modules import frozen
+from vusfa.modules import InferencePolicy
 from vusfa.scenes import SceneSet
 
 __all__ = ["evaluate", "trails", "walk"]
@@ -257,14 +257,17 @@ def trails(
 
 @contextmanager
 def _acting(policy: nn.Module, scenes: SceneSet, sample: bool, seed: int) -> Iterator[None]:
-    """Evaluation mode for every submodule, and afterwards each back in the mode it was in; cached encodings;
-    a random state of its own."""
+    """Evaluation mode for every submodule, and afterwards each back in the mode it was in; inference policies
+    cached; a random state of its own."""
     modes = [(module, module.training) for module in policy.modules()]
     policy.eval()
     devices = [scenes.device] if scenes.device.type == "cuda" else []
     exploration = ExplorationType.RANDOM if sample else ExplorationType.DETERMINISTIC
     try:
-        with torch.random.fork_rng(devices), set_exploration_type(exploration), frozen(policy):
+        with torch.random.fork_rng(devices), set_exploration_type(exploration), ExitStack() as stack:
+            for module in policy.modules():
+                if isinstance(module, InferencePolicy):
+                    stack.enter_context(module.cached())
             torch.manual_seed(seed)
             yield
     finally:

@@ -16,7 +16,7 @@ from vusfa.evaluation.exact import exact_goals, uniform_probabilities
 from vusfa.evaluation.long_table import distance_to_trained, episode_rows, exact_rows, join_tables
 from vusfa.evaluation.statistics import Sums
 from vusfa.experiments.runs import Run, read_runs
-from vusfa.modules.presets import MODELS
+from vusfa.modules.config import MODELS
 from vusfa.scenes import SceneSet
 
 __all__ = ["Experiment", "read_experiment"]

@@ -11,8 +11,7 @@ from torch import Tensor
 from vusfa.evaluation import evaluate
 from vusfa.evaluation.exact import expected_walks
 from vusfa.evaluation.metrics import get_metric
-from vusfa.evaluation.tabulated import TabulatedPolicy
-from vusfa.modules import ActingPolicy, sees_one_frame
+from vusfa.modules import InferencePolicy, TabularPolicy
 from vusfa.scenes import SceneSet
 from vusfa.training import Trainer, make_trainer
 
@@ -68,7 +67,7 @@ def fine_tune(
     curve: dict[str, list[float]] = {key: [] for key in ("frames", "length", "success", "length_ratio")}
 
     def look() -> None:
-        seen = _expected(trainer) if sees_one_frame(trainer.agent) else _walked(trainer, episodes_per_goal)
+        seen = _expected(trainer) if trainer.agent.is_tabular else _walked(trainer, episodes_per_goal)
         for key, value in zip(curve, (float(trainer.frames), *seen), strict=True):
             curve[key].append(value)
 
@@ -86,7 +85,7 @@ def fine_tune(
 def _expected(trainer: Trainer) -> tuple[float, float, float]:
     """Length, success and length over shortest path of an agent that sees one frame: computed."""
     steps = trainer.settings["env"]["max_steps"]
-    policy = TabulatedPolicy(trainer.agent, trainer.scenes, trainer.goals)
+    policy = TabularPolicy(trainer.agent, trainer.scenes, trainer.goals)
     walks = expected_walks(policy.probabilities, trainer.scenes, trainer.goals, steps)
     return walks.length.mean().item(), walks.success.mean().item(), walks.length_ratio
 
@@ -94,7 +93,7 @@ def _expected(trainer: Trainer) -> tuple[float, float, float]:
 def _walked(trainer: Trainer, episodes_per_goal: int) -> tuple[float, float, float]:
     """The same of any other: of episodes that are walked."""
     table = evaluate(
-        trainer.actor if trainer.agent.memory is not None else ActingPolicy(trainer.agent),
+        trainer.actor if trainer.agent.memory is not None else InferencePolicy(trainer.agent),
         trainer.scenes,
         trainer.goals,
         episodes_per_goal=episodes_per_goal,

@@ -22,7 +22,7 @@ from vusfa.experiments.markdown import markdown
 from vusfa.experiments.runs import Run, read_runs, write_run
 from vusfa.experiments.tables import COMPARED
 from vusfa.experiments.training import compose_settings, train
-from vusfa.modules import ActingPolicy, TriedActions, transplant
+from vusfa.modules import InferencePolicy, TriedActions, transplant
 from vusfa.scenes import SceneSet
 from vusfa.training import EvaluationProgress, load_agent, run_facts
 
@@ -53,7 +53,7 @@ def policies(agent: Any, scenes: SceneSet, weight: float, temperature: float) ->
     """Who walks in the rooms, by name."""
     sizes = scenes.num_states, scenes.num_actions
     return {
-        "agent": ActingPolicy(agent),
+        "agent": InferencePolicy(agent),
         "agent-memory": TriedActions(agent, *sizes, weight=weight, temperature=temperature),
         "memory": TriedActions(None, *sizes, weight=weight),
     }

@@ -13,10 +13,9 @@ from tensordict.nn import TensorDictModuleBase
 from vusfa.evaluation import Episodes, evaluate
 from vusfa.evaluation.exact import exact_goals
 from vusfa.evaluation.metrics import get_metric
-from vusfa.evaluation.tabulated import TabulatedPolicy
 from vusfa.experiments.manifest import BUNDLED_MANIFEST, Manifest, make_manifest, read_manifest
 from vusfa.experiments.runs import Run
-from vusfa.modules import ActingPolicy, Agent, sees_one_frame
+from vusfa.modules import Agent, InferencePolicy, TabularPolicy
 from vusfa.scenes import SceneSet
 from vusfa.training import load_agent, make_observation
 from vusfa.training.facts import run_facts
@@ -73,15 +72,15 @@ def evaluation_policy(agent: Agent, scenes: SceneSet | None = None) -> TensorDic
         scenes: where every state is going to be a goal; an agent of one frame is then written down as a
             table.
 
-    >>> from vusfa.modules import make_agent
+    >>> from vusfa.modules import TabularPolicy, make_agent
     >>> rooms = SceneSet.bundled(["bathroom"])
     >>> agent = make_agent("gvf", scenes=rooms, history=1, hidden_size=8)
     >>> type(evaluation_policy(agent)).__name__, type(evaluation_policy(agent, rooms)).__name__
-    ('ActingPolicy', 'TabulatedPolicy')
+    ('InferencePolicy', 'TabularPolicy')
     """
-    if scenes is not None and sees_one_frame(agent):
-        return TabulatedPolicy(agent, scenes)
-    return ActingPolicy(agent) if agent.memory is None else agent.get_policy_operator(out_keys=["action"])
+    if scenes is not None and agent.is_tabular:
+        return TabularPolicy(agent, scenes)
+    return InferencePolicy(agent) if agent.memory is None else agent.get_policy_operator(out_keys=["action"])
 
 
 def evaluation_precision(agent: Agent, config: Mapping[str, Any]) -> AbstractContextManager[Any]:
@@ -92,7 +91,7 @@ def evaluation_precision(agent: Agent, config: Mapping[str, Any]) -> AbstractCon
         agent: of the checkpoint.
         config: the checkpoint's settings.
     """
-    on = bool(config["autocast"]) and not sees_one_frame(agent)
+    on = bool(config["autocast"]) and not agent.is_tabular
     return torch.autocast(next(agent.parameters()).device.type, torch.bfloat16, enabled=on)
 
 
@@ -118,7 +117,7 @@ def measure_checkpoint(
             )
             for mode in MODES
         }
-    exact = exact_goals(policy.probabilities, scenes) if isinstance(policy, TabulatedPolicy) else None
+    exact = exact_goals(policy.probabilities, scenes) if isinstance(policy, TabularPolicy) else None
     info = {**run_facts(state, overrides), "checkpoint": checkpoint.name}
     return Run(experiment, name, info, tables, exact)
 

@@ -12,7 +12,7 @@ from vusfa.errors import CheckpointError
 from vusfa.experiments.fine_tune import fine_tune, fine_tuning_settings
 from vusfa.experiments.runs import Run, read_run, write_run
 from vusfa.experiments.transfer import FINE_TUNED, FROM_SCRATCH, KINDS, new_goals
-from vusfa.modules.presets import MODELS
+from vusfa.modules.config import MODELS
 from vusfa.training import load_agent, run_facts, set_threads
 
 __all__ = ["run_transfer"]

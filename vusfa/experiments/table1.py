@@ -14,7 +14,7 @@ from vusfa.experiments.measure import choose_checkpoint, measure_checkpoint
 from vusfa.experiments.runs import read_run, write_run
 from vusfa.experiments.training import compose_settings, train
 from vusfa.files import replacing
-from vusfa.modules.presets import MODELS
+from vusfa.modules.config import MODELS
 
 __all__ = ["checkpoints", "table1"]
 

@@ -32,7 +32,7 @@ from vusfa.evaluation.statistics import (
     paired_difference,
 )
 from vusfa.experiments.experiment import Experiment
-from vusfa.modules.presets import MODELS
+from vusfa.modules.config import MODELS
 
 __all__ = [
     "COLUMNS",

@@ -1,62 +1,74 @@
-"""The networks of the four models, as TensorDictModules.
+"""The networks of the models, as TensorDictModules.
 
 >>> from vusfa.modules import make_agent
 >>> from vusfa.scenes import SceneSet
->>> agent = make_agent(model="vusfa", preset="controlled", scenes=SceneSet.bundled())
+>>> agent = make_agent(model="vusfa", architecture="controlled", scenes=SceneSet.bundled())
 >>> agent.get_value_operator().out_keys[-1]
 'state_value'
 """
 
-from vusfa.modules.acting import ActingPolicy, action_chances, action_logits, draw, draw_actions
+from vusfa.deprecated import moved_names
 from vusfa.modules.agents import Agent, make_agent, transplant
 from vusfa.modules.autoencoder import explained_features, pretrain_autoencoder
-from vusfa.modules.bottleneck import GaussianEncoder, LatentSampler
+from vusfa.modules.bottleneck import GaussianBottleneck, LatentSampler, gaussian_kl
+from vusfa.modules.config import ARCHITECTURES, MODELS, AgentConfig, Model, register_model, resolve_config
+from vusfa.modules.draws import action_probs, draw, draw_actions
 from vusfa.modules.episodic import TriedActions
 from vusfa.modules.frames import FeatureFrames, PictureFrames
-from vusfa.modules.freezing import frozen
+from vusfa.modules.inference import InferencePolicy, TabularPolicy
 from vusfa.modules.linear import HistoryLinear, SceneLinear
-from vusfa.modules.normalised import NormalisedEncoder
-from vusfa.modules.pairs import ActionTable, StateGoalPairs, sees_one_frame
 from vusfa.modules.policy import PolicyHead, SuccessorPolicyHead
-from vusfa.modules.presets import MODELS, PRESETS, AgentConfig, resolve_config
 from vusfa.modules.siamese import SiameseEncoder
 from vusfa.modules.successor import RewardHead, SuccessorHead, SuccessorValue, ValueHead
 from vusfa.modules.trunk import Fusion, SceneLayer
+from vusfa.modules.unique import gather, unique_rows
+from vusfa.modules.upgrade import upgrade_agent_config, upgrade_agent_state
 
 __all__ = [
+    "ARCHITECTURES",
     "MODELS",
-    "PRESETS",
-    "ActingPolicy",
-    "ActionTable",
     "Agent",
     "AgentConfig",
     "FeatureFrames",
     "Fusion",
-    "GaussianEncoder",
+    "GaussianBottleneck",
     "HistoryLinear",
+    "InferencePolicy",
     "LatentSampler",
-    "NormalisedEncoder",
+    "Model",
     "PictureFrames",
     "PolicyHead",
     "RewardHead",
     "SceneLayer",
     "SceneLinear",
     "SiameseEncoder",
-    "StateGoalPairs",
     "SuccessorHead",
     "SuccessorPolicyHead",
     "SuccessorValue",
+    "TabularPolicy",
     "TriedActions",
     "ValueHead",
-    "action_chances",
-    "action_logits",
+    "action_probs",
     "draw",
     "draw_actions",
     "explained_features",
-    "frozen",
+    "gather",
+    "gaussian_kl",
     "make_agent",
     "pretrain_autoencoder",
+    "register_model",
     "resolve_config",
-    "sees_one_frame",
     "transplant",
+    "unique_rows",
+    "upgrade_agent_config",
+    "upgrade_agent_state",
 ]
+
+__getattr__ = moved_names(
+    __name__,
+    {
+        "PRESETS": "vusfa.modules.ARCHITECTURES",
+        "ActingPolicy": "vusfa.modules.InferencePolicy",
+        "action_chances": "vusfa.modules.action_probs",
+    },
+)

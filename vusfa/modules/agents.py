@@ -3,13 +3,14 @@
 >>> from vusfa.modules import make_agent
 >>> from vusfa.scenes import SceneSet
 >>> scenes = SceneSet.bundled(["bathroom"])
->>> agent = make_agent(model="vusfa", preset="controlled", scenes=scenes)
+>>> agent = make_agent(model="vusfa", architecture="controlled", scenes=scenes)
 >>> actor, critic = agent.get_policy_operator(), agent.get_value_operator()
 """
 
 from __future__ import annotations
 
 import dataclasses
+import warnings
 from collections.abc import Sequence
 from typing import Any
 
@@ -18,21 +19,19 @@ from tensordict.nn import (
     InteractionType,
     ProbabilisticTensorDictModule,
     ProbabilisticTensorDictSequential,
-    TensorDictModule,
-    TensorDictModuleBase,
     TensorDictSequential,
 )
+from tensordict.nn import TensorDictModule as Step
 from torch import nn
 from torch.distributions import Categorical
 from torchrl.envs.transforms import InitTracker, Transform
 from torchrl.modules import LSTMModule
 
 from vusfa.errors import ConfigError
-from vusfa.modules.bottleneck import GaussianEncoder, LatentSampler
+from vusfa.modules.bottleneck import GaussianBottleneck, LatentSampler
+from vusfa.modules.config import AgentConfig, resolve_config
 from vusfa.modules.frames import FeatureFrames, PictureFrames, picture_table
-from vusfa.modules.normalised import NormalisedEncoder
 from vusfa.modules.policy import PolicyHead, SuccessorPolicyHead
-from vusfa.modules.presets import AgentConfig, resolve_config
 from vusfa.modules.siamese import SiameseEncoder
 from vusfa.modules.successor import RewardHead, SuccessorHead, SuccessorValue, ValueHead
 from vusfa.modules.trunk import Fusion, SceneLayer, SiameseTrunk
@@ -40,20 +39,21 @@ from vusfa.modules.trunk import Fusion, SceneLayer, SiameseTrunk
 __all__ = ["Agent", "make_agent", "transplant"]
 
 
-def make_agent(model: str, preset: str = "controlled", scenes: Any = None, **overrides: Any) -> Agent:
-    """Builds one of the four models.
+def make_agent(model: str, architecture: str = "controlled", scenes: Any = None, **overrides: Any) -> Agent:
+    """Build one of the models.
 
     Args:
-        model: ``"gvf"`` (Zhu et al. 2017), ``"usfa"``, ``"sfdp"`` or ``"vusfa"``.
-        preset: ``"controlled"`` (the models differ only in the named ideas), ``"paper"`` (the text) or
+        model: ``"gvf"`` (Zhu et al. 2017), ``"usfa"``, ``"sfdp"`` or ``"vusfa"``, or the name of a
+            :func:`~vusfa.modules.register_model`.
+        architecture: ``"controlled"`` (the models differ only in the named ideas), ``"paper"`` (the text) or
             ``"reference"`` (the released code with its quirks).
-        scenes: the :class:`vusfa.scenes.SceneSet` to live in; it gives the features, and one head a scene
+        scenes: the :class:`vusfa.scenes.SceneSet` to live in; it gives the features, and one head per scene
             unless ``shared_heads=True``.
-        overrides: fields of :class:`~vusfa.modules.presets.AgentConfig`, such as ``history=1`` or
+        overrides: fields of :class:`~vusfa.modules.config.AgentConfig`, such as ``history=1`` or
             ``memory="lstm"``.
 
     Raises:
-        ConfigError: an unknown model, preset, field or value.
+        ConfigError: an unknown model, architecture, field or value.
 
     >>> import torch
     >>> from vusfa.scenes import SceneSet
@@ -61,18 +61,25 @@ def make_agent(model: str, preset: str = "controlled", scenes: Any = None, **ove
     >>> agent.config["history"], sum(p.numel() for p in agent.parameters()) > 0
     (2, True)
     """
-    config = resolve_config(model, preset, **overrides)
+    if "preset" in overrides:
+        warnings.warn(
+            "make_agent's preset is called architecture since version 0.2; the old name goes with 0.3",
+            DeprecationWarning,
+            stacklevel=2,
+        )
+        architecture = overrides.pop("preset")
+    config = resolve_config(model, architecture, **overrides)
     if scenes is None:
         raise ConfigError(
             "make_agent needs scenes=...; SceneSet.bundled() gives the four that come with the package"
         )
-    return Agent(config, scenes)
+    return (config.ideas.agent or Agent)(config, scenes)
 
 
 def transplant(agent: Agent, scenes: Any) -> Agent:
     """A copy of an agent with ``shared_heads`` that lives in other scenes, with the same weights.
 
-    It looks at the new scenes as at those it was trained in: features are normalised by the mean and
+    It looks at the new scenes as at those it was trained in: features are normalized by the mean and
     deviation of the TRAINING scenes, which are among its weights. For equal features it gives equal numbers.
 
     Args:
@@ -130,7 +137,7 @@ class Agent(nn.Module):
     | ``logits``, ``action``, ``action_log_prob`` | (\\*B, A), (\\*B,), (\\*B,) | actor |
 
     Args:
-        config: see :func:`~vusfa.modules.presets.resolve_config`.
+        config: see :func:`~vusfa.modules.config.resolve_config`.
         scenes: a ``SceneSet``.
 
     Attributes:
@@ -141,64 +148,119 @@ class Agent(nn.Module):
     def __init__(self, config: AgentConfig, scenes: Any) -> None:
         super().__init__()
         self.config = _plain(config, scenes)
-        ideas, size, hidden = config.ideas, config.embedding_size, config.hidden_size
-        num_scenes = 1 if config.shared_heads else scenes.num_scenes
-        self.encoder: nn.Module = _make_encoder(config, scenes)
+        self.num_scenes: int = 1 if config.shared_heads else scenes.num_scenes
+        hidden = config.hidden_size
+        self.encoder: nn.Module = self.make_encoder(config, scenes)
         self.encoder.requires_grad_(config.pretrained is None)
-        self.fusion = Fusion(size, hidden)
-        self.scene_layer = SceneLayer(num_scenes, hidden, hidden)
-        self.latent = LatentSampler(config.eval_latent) if ideas.bottleneck else None
-        self.successor = (
-            SuccessorHead(num_scenes, hidden, size, config.successor_scale) if ideas.successor_value else None
-        )
-        self.reward = RewardHead(size, hidden, config.reward_scale) if ideas.successor_value else None
-        self.value = SuccessorValue() if ideas.successor_value else ValueHead(num_scenes, hidden)
-        self.policy: nn.Module = PolicyHead(num_scenes, hidden, scenes.num_actions)
-        if ideas.successor_policy:
-            self.policy = SuccessorPolicyHead(
-                num_scenes,
-                hidden,
-                size,
-                scenes.num_actions,
-                successor_norm=config.successor_norm,
-                successor_gain=config.successor_gain,
-                rectify_logits=config.rectify_logits,
-            )
+        self.fusion = Fusion(config.embedding_size, hidden)
+        self.scene_layer = SceneLayer(self.num_scenes, hidden, hidden)
+        self.latent = LatentSampler(config.eval_latent) if config.ideas.bottleneck else None
+        self.successor, self.reward, self.value = self.make_value(config)
+        self.policy: nn.Module = self.make_policy(config, scenes.num_actions)
         self.memory = nn.LSTM(hidden, hidden, batch_first=True) if config.memory == "lstm" else None
-        # Not registered as children: the layers are, once, under the names above.
-        self.__dict__["_operators"] = self._wrap(config)
+        self._steps = self.make_steps(config)  # a plain dict: the layers are children under the names above
 
-    def _wrap(self, config: AgentConfig) -> dict[str, TensorDictModuleBase]:
+    @property
+    def is_tabular(self) -> bool:
+        """Whether the actions depend on the ids of one state and one goal alone.
+
+        >>> from vusfa.scenes import SceneSet
+        >>> make_agent("gvf", scenes=SceneSet.bundled(["bathroom"])).is_tabular
+        False
+        """
+        config = self.config
+        return config["history"] == 1 and config["observation"] == "index" and config["memory"] is None
+
+    def make_encoder(self, config: AgentConfig, scenes: Any) -> nn.Module:
+        """phi; reads states and goals, see :class:`~vusfa.modules.siamese.SiameseEncoder`."""
         by_id = config.observation == "index"
-        read = ["state_id", "goal_id"] if by_id else ["observation", "goal_observation"]
-        embeddings = ["state_embedding", "goal_embedding"]
-        gaussian = ["state_loc", "state_scale", "state_kl", "goal_loc", "goal_scale", "goal_kl"]
-        steps: dict[str, TensorDictModuleBase] = {}
-        written = [*embeddings, *(gaussian if self.latent else []), "fused"]
-        steps["trunk"] = TensorDictModule(SiameseTrunk(self.encoder, self.fusion), read, written)
-        if self.memory is not None:
-            steps["memory"] = LSTMModule(lstm=self.memory, in_key="fused", out_key="remembered")
-        fused = "fused" if self.memory is None else "remembered"
-        steps["scene_layer"] = TensorDictModule(self.scene_layer, [fused, "scene_id"], ["hidden"])
-        if self.successor is not None:
-            steps["successor"] = TensorDictModule(
-                self.successor, ["hidden", "scene_id"], ["successor_features"]
-            )
-            if self.latent is not None:
-                steps["latent"] = TensorDictModule(self.latent, ["goal_loc", "goal_scale"], ["goal_latent"])
-            goal = "goal_embedding" if self.latent is None else "goal_latent"
-            steps["reward"] = TensorDictModule(self.reward, [goal], ["reward_weights"])
-            parts = ["successor_features", "reward_weights"]
-            steps["value"] = TensorDictModule(self.value, parts, ["state_value"])
+        frames: FeatureFrames | PictureFrames
+        if config.encoder == "conv":
+            frames = PictureFrames(picture_table(scenes) if by_id else None, config.picture_size)
         else:
-            steps["value"] = TensorDictModule(self.value, ["hidden", "scene_id"], ["state_value"])
-        psi = ["successor_features"] if config.ideas.successor_policy else []
-        steps["policy"] = TensorDictModule(self.policy, ["hidden", *psi, "scene_id"], ["logits"])
+            frames = FeatureFrames(scenes.features, lookup=by_id, normalize=config.normalize_features)
+        return SiameseEncoder(
+            frames,
+            config.history,
+            config.hidden_size,
+            config.embedding_size if config.embedding_layer else None,
+            shared=config.shared_encoder,
+            state_layer=config.state_layer,
+            by_id=by_id,
+            bottleneck=GaussianBottleneck(config.scale, config.initial_scale)
+            if config.ideas.bottleneck
+            else None,
+            normalize=config.normalize_embedding,
+        )
+
+    def make_value(self, config: AgentConfig) -> tuple[nn.Module | None, nn.Module | None, nn.Module]:
+        """psi, omega and what makes a value of them; or none, none and a value of the hidden state."""
+        size, hidden = config.embedding_size, config.hidden_size
+        if not config.ideas.successor_value:
+            return None, None, ValueHead(self.num_scenes, hidden)
+        successor = SuccessorHead(self.num_scenes, hidden, size, config.successor_scale)
+        return successor, RewardHead(size, hidden, config.reward_scale), SuccessorValue()
+
+    def make_policy(self, config: AgentConfig, num_actions: int) -> nn.Module:
+        """Logits of the hidden state and, where :meth:`policy_keys` name more, of that."""
+        plain = PolicyHead(self.num_scenes, config.hidden_size, num_actions)  # drawn by all: seeds stay equal
+        if not config.ideas.successor_policy:
+            return plain
+        return SuccessorPolicyHead(
+            self.num_scenes,
+            config.hidden_size,
+            config.embedding_size,
+            num_actions,
+            successor_norm=config.successor_norm,
+            rectify_logits=config.rectify_logits,
+        )
+
+    def policy_keys(self, config: AgentConfig) -> list[str]:
+        """Entries that the policy reads, in the order of its arguments."""
+        return ["hidden", *(["successor_features"] if config.ideas.successor_policy else []), "scene_id"]
+
+    def make_steps(self, config: AgentConfig) -> dict[str, Step]:
+        """Name to step: each layer with the entries that it reads and writes, in the order of computation."""
+        read = (
+            ["state_id", "goal_id"] if config.observation == "index" else ["observation", "goal_observation"]
+        )
+        gaussian = ["state_loc", "state_scale", "state_kl", "goal_loc", "goal_scale", "goal_kl"]
+        written = ["state_embedding", "goal_embedding", *(gaussian if self.latent else []), "fused"]
+        steps: dict[str, Step] = {"trunk": Step(SiameseTrunk(self.encoder, self.fusion), read, written)}
+        fused = "fused"
+        if self.memory is not None:
+            fused = "remembered"
+            steps["memory"] = LSTMModule(lstm=self.memory, in_key="fused", out_key=fused)
+        steps["scene_layer"] = Step(self.scene_layer, [fused, "scene_id"], ["hidden"])
+        if self.successor is not None:
+            steps["successor"] = Step(self.successor, ["hidden", "scene_id"], ["successor_features"])
+            goal = "goal_embedding"
+            if self.latent is not None:
+                goal = "goal_latent"
+                steps["latent"] = Step(self.latent, ["goal_loc", "goal_scale"], [goal])
+            steps["reward"] = Step(self.reward, [goal], ["reward_weights"])
+            read_by_value = ["successor_features", "reward_weights"]
+        else:
+            read_by_value = ["hidden", "scene_id"]
+        steps["value"] = Step(self.value, read_by_value, ["state_value"])
+        steps["policy"] = Step(self.policy, self.policy_keys(config), ["logits"])
         return steps
 
-    def _trunk(self) -> list[TensorDictModuleBase]:
-        operators = self.__dict__["_operators"]
-        return [operators[name] for name in ("trunk", "memory", "scene_layer") if name in operators]
+    def actor_steps(self) -> list[Step]:
+        """Steps from observations to ``logits``: those that the policy needs, and no other."""
+        return self._steps_to("logits")
+
+    def critic_steps(self) -> list[Step]:
+        """Steps from observations to ``state_value``."""
+        return self._steps_to("state_value")
+
+    def _steps_to(self, key: str) -> list[Step]:
+        needed, chosen = {key}, []
+        for step in reversed(self._steps.values()):
+            if needed & set(step.out_keys):
+                needed |= set(step.in_keys)
+                chosen.append(step)
+        return chosen[::-1]
 
     def get_policy_operator(
         self, out_keys: Sequence[NestedKey] = ("action", "action_log_prob")
@@ -210,8 +272,6 @@ class Agent(nn.Module):
                 because everything kept travels through collectors. ``get_dist`` and losses see all of them
                 in any case.
         """
-        operators = self.__dict__["_operators"]
-        head = [operators["successor"]] if isinstance(self.policy, SuccessorPolicyHead) else []
         sampler = ProbabilisticTensorDictModule(
             in_keys=["logits"],
             out_keys=["action"],
@@ -221,46 +281,20 @@ class Agent(nn.Module):
             return_log_prob="action_log_prob" in out_keys,
             log_prob_key="action_log_prob",
         )
-        recurrent = [key for key in operators["memory"].out_keys[1:]] if self.memory is not None else []
+        recurrent = self._steps["memory"].out_keys[1:] if self.memory is not None else []
         return ProbabilisticTensorDictSequential(
-            *self._trunk(), *head, operators["policy"], sampler, selected_out_keys=[*out_keys, *recurrent]
+            *self.actor_steps(), sampler, selected_out_keys=[*out_keys, *recurrent]
         )
 
     def get_value_operator(self) -> TensorDictSequential:
         """The critic; it leaves every key it writes, ``state_value`` the last."""
-        operators = self.__dict__["_operators"]
-        heads = [operators[name] for name in ("successor", "latent", "reward", "value") if name in operators]
-        return TensorDictSequential(*self._trunk(), *heads)
+        return TensorDictSequential(*self.critic_steps())
 
     def make_env_transforms(self) -> list[Transform]:
         """What an environment must add to its observations: nothing, or an LSTM's start marks and state."""
         if self.memory is None:
             return []
-        return [InitTracker(), self.__dict__["_operators"]["memory"].make_tensordict_primer()]
-
-
-def _make_encoder(config: AgentConfig, scenes: Any) -> nn.Module:
-    by_id = config.observation == "index"
-    frames: FeatureFrames | PictureFrames
-    if config.encoder == "conv":
-        frames = PictureFrames(picture_table(scenes) if by_id else None, config.picture_size)
-    else:
-        frames = FeatureFrames(scenes.features, lookup=by_id, normalise=config.normalise_features)
-    bottleneck = config.ideas.bottleneck
-    code_size = config.embedding_size * (2 if bottleneck else 1)
-    encoder = SiameseEncoder(
-        frames,
-        config.history,
-        config.hidden_size,
-        code_size if config.embedding_layer else None,
-        shared=config.shared_encoder,
-        state_layer=config.state_layer,
-        by_id=by_id,
-    )
-    embeddings: nn.Module = encoder
-    if bottleneck:
-        embeddings = GaussianEncoder(encoder, config.scale, config.initial_scale)
-    return NormalisedEncoder(embeddings) if config.normalise_embedding else embeddings
+        return [InitTracker(), self._steps["memory"].make_tensordict_primer()]
 
 
 def _plain(config: AgentConfig, scenes: Any) -> dict[str, Any]:

@@ -33,14 +33,14 @@ def pretrain_autoencoder(
 
     .. math:: \min_{\phi, W} \; E_s \lVert W \phi(s) - x(s) \rVert^2
 
-    over all states of the agent's scenes, x(s) the features of the frame (normalised, where the agent
-    normalises them) and phi(s) the ``state_embedding`` of a history that holds it alone. The encoder's
+    over all states of the agent's scenes, x(s) the features of the frame (normalized, where the agent
+    normalizes them) and phi(s) the ``state_embedding`` of a history that holds it alone. The encoder's
     weights are constants afterwards, as in every agent with ``pretrained="autoencoder"``.
 
     Args:
         agent: its encoder is changed.
         steps: of Adam, with a learning rate that falls linearly to 0.
-        batch_size: states a step.
+        batch_size: states per step.
         lr: learning rate at the start.
         seed: of batches and decoder.
 
@@ -61,8 +61,7 @@ def pretrain_autoencoder(
     if agent.config["pretrained"] != "autoencoder":
         raise ConfigError("only an agent made with pretrained='autoencoder' has its encoder pretrained")
     encoder = agent.encoder
-    frames = next(module for module in encoder.modules() if hasattr(module, "lookup"))
-    features: Tensor = frames.lookup(None)  # type: ignore[operator]
+    features: Tensor = encoder.frames.lookup(None)
     generator = torch.Generator().manual_seed(seed)
     decoder = nn.Linear(agent.config["embedding_size"], features.shape[-1]).to(features.device)
     with torch.no_grad():
@@ -74,14 +73,14 @@ def pretrain_autoencoder(
 
     encoder.requires_grad_(True)
     try:
-        optimiser = torch.optim.Adam([*encoder.parameters(), *decoder.parameters()], lr=lr)
+        optimizer = torch.optim.Adam([*encoder.parameters(), *decoder.parameters()], lr=lr)
         for step in range(steps):
-            for group in optimiser.param_groups:
+            for group in optimizer.param_groups:
                 group["lr"] = lr * (1 - step / steps)
             states = torch.randint(len(features), (batch_size,), generator=generator).to(features.device)
-            optimiser.zero_grad()
+            optimizer.zero_grad()
             functional.mse_loss(made(states), features[states]).backward()
-            optimiser.step()
+            optimizer.step()
     finally:
         encoder.requires_grad_(False)
     with torch.no_grad():

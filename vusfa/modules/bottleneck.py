@@ -7,94 +7,92 @@ The encoder gives mean and scale of z for state and goal. pi and psi read the me
 from __future__ import annotations
 
 import math
-from typing import Any, Literal, NamedTuple
+from typing import Literal
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
 from vusfa.errors import ConfigError
-from vusfa.modules.siamese import Head, Heads, SiameseEncoder, as_it_is, interleaved, num_parts
-from vusfa.objectives.functional import gaussian_kl
 
-__all__ = ["GaussianEncoder", "LatentSampler"]
+__all__ = ["GaussianBottleneck", "LatentSampler", "gaussian_kl"]
 
 
-class GaussianEncoder(nn.Module):
-    """A siamese encoder whose code of size 2 E is the mean and the scale of a Gaussian of size E.
+def gaussian_kl(loc: Tensor, scale: Tensor, eps: float = 1e-8) -> Tensor:
+    r"""Divergence of N(loc, scale^2) from N(0, 1), elementwise, in nats.
+
+    .. math::
+        \tfrac12 \left(\mu^2 + \sigma^2 - \log(\sigma^2 + \epsilon) - 1\right)
+
+    Only the scale's square counts, so that a network's plain linear output, of either sign, may be the scale.
 
     Args:
-        encoder: siamese encoder with ``out_features = 2 E``.
-        scale: ``"softplus"``: ``softplus`` of the second half, positive. ``"raw"``: the second half as it
-            is, of either sign, as in the released code.
-        initial_scale: what the scale starts near, by the bias of its layer; ``"softplus"`` only. ``None``
-            leaves the bias as it is drawn: near log 2.
+        loc: mean, any shape.
+        scale: standard deviation, the same shape.
+        eps: keeps the logarithm finite at scale 0.
+
+    Returns:
+        the shape of ``loc``.
+
+    Raises:
+        ValueError: when the shapes differ.
+
+    >>> gaussian_kl(torch.tensor([0.0, 2.0]), torch.tensor([1.0, -1.0]))
+    tensor([0., 2.])
+    """
+    if loc.shape != scale.shape:
+        shapes = {"loc": tuple(loc.shape), "scale": tuple(scale.shape)}
+        raise ValueError(f"gaussian_kl: shapes differ: {shapes}; give equal ones")
+    if loc.dtype in (torch.bfloat16, torch.float16):
+        # eps and the difference of near-equal numbers need more digits, as under autocast
+        loc, scale = loc.float(), scale.float()
+    variance = scale.square()
+    return 0.5 * (loc.square() + variance - torch.log(variance + eps) - 1.0)
+
+
+class GaussianBottleneck(nn.Module):
+    """A code of size 2 E as the mean and the scale of a Gaussian of size E.
+
+    Args:
+        scale: ``"softplus"``: ``softplus`` of the code's second half, positive. ``"raw"``: the second half
+            itself, of either sign, as in the released code.
+        initial_scale: scale at the start, set by the bias of the layer that makes the code; ``"softplus"``
+            only. ``None`` leaves the bias as it is drawn: near log 2.
 
     Raises:
         ConfigError: ``initial_scale`` with ``"raw"``, or not positive.
 
-    >>> from vusfa.modules.frames import FeatureFrames
-    >>> encoder = SiameseEncoder(FeatureFrames(torch.rand(12, 1, 8)), 4, 16, 2 * 6)
-    >>> gaussian, state_id = GaussianEncoder(encoder, initial_scale=0.1), torch.zeros(3, 4, dtype=torch.int64)
-    >>> *of_state, goal_loc, goal_scale, goal_kl = gaussian(state_id, torch.arange(3))
-    >>> goal_scale.shape, bool((goal_scale > 0).all()), goal_kl.shape
+    >>> loc, scale, kl = GaussianBottleneck()(torch.randn(3, 12))
+    >>> loc.shape, bool((scale > 0).all()), kl.shape
     (torch.Size([3, 6]), True, torch.Size([3, 1]))
     """
 
     def __init__(
-        self,
-        encoder: SiameseEncoder,
-        scale: Literal["softplus", "raw"] = "softplus",
-        initial_scale: float | None = None,
+        self, scale: Literal["softplus", "raw"] = "softplus", initial_scale: float | None = None
     ) -> None:
         super().__init__()
         if scale not in ("softplus", "raw"):
             raise ConfigError(f"scale is {scale!r}; it must be 'softplus' or 'raw'")
-        self.encoder = encoder
+        if initial_scale is not None and (scale == "raw" or initial_scale <= 0):
+            raise ConfigError(
+                f"initial_scale is {initial_scale} with scale {scale!r};"
+                " give a number above 0 with 'softplus', or None"
+            )
         self.scale = scale
-        if initial_scale is not None:
-            if scale == "raw" or initial_scale <= 0:
-                raise ConfigError(
-                    f"initial_scale is {initial_scale} with scale {scale!r};"
-                    " give a number above 0 with 'softplus', or None"
-                )
-            for branch in {encoder.branch, encoder.goal_branch or encoder.branch}:
-                last = branch.last
-                assert last is not None, "a Gaussian code comes from a linear second layer"
-                with torch.no_grad():
-                    last.bias[last.out_features // 2 :] = math.log(math.expm1(initial_scale))
+        self.initial_scale = initial_scale
 
-    def forward(self, state: Tensor, goal: Tensor) -> tuple[Tensor, ...]:
-        """Embeddings of state and goal, which are the means; then mean, scale and KL of each; all (\\*B, E),
-        the KL (\\*B, 1)."""
-        return interleaved(*self.both(state, goal, (as_it_is, as_it_is)))
+    @torch.no_grad()
+    def start(self, layer: nn.Linear) -> None:
+        """Set the bias of the layer that makes the code so that scales begin near ``initial_scale``."""
+        if self.initial_scale is not None:
+            layer.bias[layer.out_features // 2 :] = math.log(math.expm1(self.initial_scale))
 
-    def both(self, state: Tensor, goal: Tensor, heads: Heads, part: int | None = None) -> tuple[Any, Any]:
-        """What the heads make of the means; then mean, scale and KL; or one part of all these."""
-        gaussian = _Gaussian(self.scale, heads[0]), _Gaussian(self.scale, heads[1])
-        return self.encoder.both(state, goal, gaussian, part)
-
-
-class _Gaussian(NamedTuple):
-    """Codes to what the head makes of the mean, mean, scale and KL; equal to another one that does the
-    same."""
-
-    scale: str
-    head: Head
-
-    def __call__(self, code: Tensor) -> tuple[Tensor, ...]:
+    def forward(self, code: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Mean and scale (\\*B, E), and KL, summed over E, (\\*B, 1), of codes (\\*B, 2 E)."""
         loc, scale = code.chunk(2, -1)
         if self.scale == "softplus":
             scale = functional.softplus(scale)
-        made = self.head(loc)
-        kl = gaussian_kl(loc, scale).sum(-1, keepdim=True)
-        return *(made if isinstance(made, tuple) else (made,)), loc, scale, kl
-
-    def alone(self, part: int) -> Head | None:
-        """The head of this part alone, where it is made of the means, which are the code's leading half."""
-        if part >= num_parts(self.head):
-            return None
-        return lambda loc: self.head(loc)[part] if num_parts(self.head) > 1 else self.head(loc)
+        return loc, scale, gaussian_kl(loc, scale).sum(-1, keepdim=True)
 
 
 class LatentSampler(nn.Module):

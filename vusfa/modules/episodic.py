@@ -14,8 +14,9 @@ from tensordict.nn import TensorDictModuleBase
 from tensordict.nn.probabilistic import interaction_type
 from torch import Tensor
 
-from vusfa.modules.acting import action_logits, draw_actions
 from vusfa.modules.agents import Agent
+from vusfa.modules.draws import draw_actions
+from vusfa.modules.inference import InferencePolicy
 
 __all__ = ["TriedActions"]
 
@@ -61,7 +62,7 @@ class TriedActions(TensorDictModuleBase):
         super().__init__()
         if agent is not None and (agent.memory is not None or agent.config["observation"] != "index"):
             raise ValueError("the agent must read ids and have no memory of its own")
-        self.agent = agent
+        self.policy = None if agent is None else InferencePolicy(agent)
         self.num_states, self.num_actions = num_states, num_actions
         self.weight, self.temperature = weight, temperature
         self.in_keys = ["state_id", "goal_id", "scene_id", "tried", "is_init"]
@@ -82,7 +83,7 @@ class TriedActions(TensorDictModuleBase):
 
     def _logits(self, tensordict: TensorDictBase) -> Tensor:
         state = tensordict.get("state_id")
-        if self.agent is None:
+        if self.policy is None:
             return torch.zeros(len(state), self.num_actions, device=state.device)
         goal, scene = tensordict.get("goal_id"), tensordict.get("scene_id")
-        return action_logits(self.agent, state, goal, scene) / self.temperature
+        return self.policy.logits(state, goal, scene) / self.temperature

@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from vusfa.errors import ConfigError
-from vusfa.modules.freezing import for_autocast
+from vusfa.modules.precision import for_autocast
 
 __all__ = ["FeatureFrames", "PictureFrames", "shrink_pictures"]
 
@@ -27,10 +27,10 @@ class FeatureFrames(nn.Module):
     Args:
         features: (S, C, F) float32 of all states, as in ``SceneSet.features``.
         lookup: keep the table; ``False`` for an agent that is handed features.
-        normalise: bring every feature to mean 0 and deviation 1 over the S states. The 2 F numbers are
+        normalize: bring every feature to mean 0 and deviation 1 over the S states. The 2 F numbers are
             part of the ``state_dict``, because the weights behind them mean nothing with others.
 
-    >>> frames = FeatureFrames(torch.rand(12, 1, 8), normalise=True)
+    >>> frames = FeatureFrames(torch.rand(12, 1, 8), normalize=True)
     >>> frames.lookup(torch.tensor([[3, 5]])).shape, len(frames.state_dict())
     (torch.Size([1, 2, 8]), 2)
     """
@@ -40,20 +40,20 @@ class FeatureFrames(nn.Module):
     mean: Tensor
     deviation: Tensor
 
-    def __init__(self, features: Tensor, lookup: bool = True, normalise: bool = False) -> None:
+    def __init__(self, features: Tensor, lookup: bool = True, normalize: bool = False) -> None:
         super().__init__()
         table = features[:, 0].to(torch.float32).contiguous()
         self.size = table.shape[-1]
-        self.normalise = normalise
+        self.normalize = normalize
         self._converted: Tensor | None = None
         self.register_buffer("table", table if lookup else table[:0].clone(), persistent=False)
-        if normalise:
+        if normalize:
             # A feature that never changes would be divided by nothing; it becomes 0 and stays out of the way.
             self.register_buffer("mean", table.mean(0))
             self.register_buffer("deviation", table.std(0, correction=0).clamp(min=1e-3))
             # Kept as the encoder wants it, and brought up to date when other numbers are loaded.
             self.table = (self.table - self.mean) / self.deviation
-            self._register_load_state_dict_pre_hook(self._renormalise)
+            self._register_load_state_dict_pre_hook(self._renormalize)
 
     @property
     def num_states(self) -> int:
@@ -82,10 +82,10 @@ class FeatureFrames(nn.Module):
 
     def encode(self, observation: Tensor) -> Tensor:
         """Features (\\*B, F) as the encoder wants them, of features (\\*B, F) as the scene has them."""
-        return (observation - self.mean) / self.deviation if self.normalise else observation
+        return (observation - self.mean) / self.deviation if self.normalize else observation
 
     @torch.no_grad()
-    def _renormalise(self, state: dict[str, Any], prefix: str, *_: Any) -> None:
+    def _renormalize(self, state: dict[str, Any], prefix: str, *_: Any) -> None:
         """Before other means and deviations come in: the table by them."""
         mean, deviation = (state.get(prefix + name) for name in ("mean", "deviation"))
         if mean is None or deviation is None or mean.shape != self.mean.shape:

@@ -12,8 +12,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from vusfa.modules.freezing import Freezable, for_autocast
-from vusfa.modules.rows import RowScenes, SceneBlocks, SceneRows, steady_linear
+from vusfa.modules.precision import for_autocast, padded_linear
+from vusfa.modules.rows import RowScenes, SceneBlocks, SortedByScene
 
 __all__ = ["HistoryLinear", "SceneLinear"]
 
@@ -23,7 +23,7 @@ _DENSE_OUTPUTS = 64
 _DENSE_SCENES = 8
 
 
-class SceneLinear(Freezable):
+class SceneLinear(nn.Module):
     """An affine layer with weights of its own for each scene: row i meets those of scene ``scene_id[i]``.
 
     Batches that mix scenes are sorted by scene, so that each scene costs one matrix product of its own
@@ -58,7 +58,6 @@ class SceneLinear(Freezable):
         self.out_features = out_features
         self.weight = nn.Parameter(torch.empty(num_scenes, out_features, in_features))
         self.bias = nn.Parameter(torch.empty(num_scenes, out_features))
-        self._frozen: tuple[Tensor, Tensor] | None = None
         self.reset_parameters()
 
     def reset_parameters(self) -> None:
@@ -67,13 +66,14 @@ class SceneLinear(Freezable):
 
     def forward(self, x: Tensor, scene_id: RowScenes) -> Tensor:
         """Maps (\\*B, in) with scene indices (\\*B,) int64 to (\\*B, out); rows sorted by scene, (R, in), may
-        come with their :class:`SceneRows`, and blocks (n, m, in) with their :class:`SceneBlocks`."""
-        weight, bias = self._weights(x)
+        come with their :class:`SortedByScene`, and blocks (n, m, in) with their :class:`SceneBlocks`."""
+        # Converted in one piece: autocast would convert each scene's slice on its own.
+        weight, bias = for_autocast(self.weight), for_autocast(self.bias)
         if self.num_scenes == 1:
-            return steady_linear(x, weight.squeeze(0), bias.squeeze(0))
+            return padded_linear(x, weight.squeeze(0), bias.squeeze(0))
         if isinstance(scene_id, SceneBlocks):
             return torch.baddbmm(bias.unsqueeze(1), x, weight.transpose(1, 2))
-        if isinstance(scene_id, SceneRows):
+        if isinstance(scene_id, SortedByScene):
             if self.num_scenes * self.out_features <= _DENSE_OUTPUTS:
                 return self._all_scenes(x, scene_id.scene, weight, bias)
             parts = self._products(x, scene_id.counts, weight.unbind(0), bias.unbind(0))
@@ -88,7 +88,7 @@ class SceneLinear(Freezable):
         return result.reshape(*x.shape[:-1], self.out_features)
 
     def _all_scenes(self, rows: Tensor, scene: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
-        every = steady_linear(rows, weight.flatten(0, 1), bias.flatten())
+        every = padded_linear(rows, weight.flatten(0, 1), bias.flatten())
         every = every.view(-1, self.num_scenes, self.out_features)
         return every.gather(1, scene.view(-1, 1, 1).expand(-1, 1, self.out_features)).squeeze(1)
 
@@ -98,7 +98,7 @@ class SceneLinear(Freezable):
         weights, biases = weight.unbind(0), bias.unbind(0)
         if max(counts) == len(rows):
             only = counts.index(len(rows))
-            return steady_linear(rows, weights[only], biases[only])
+            return padded_linear(rows, weights[only], biases[only])
         if bool((scene[1:] >= scene[:-1]).all()):  # as a batch sorted by scene has it: nothing to move
             return torch.cat(self._products(rows, counts, weights, biases))
         order = scene.argsort(stable=True)
@@ -113,23 +113,7 @@ class SceneLinear(Freezable):
     ) -> list[Tensor]:
         """Of rows sorted by scene, each scene's with its weights."""
         parts = zip(rows.split(counts), weights, biases, strict=True)
-        return [steady_linear(part, weight, bias) for part, weight, bias in parts if len(part)]
-
-    def _weights(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        if self._frozen is not None and (self._frozen[0].requires_grad or not torch.is_grad_enabled()):
-            return self._frozen
-        # In one piece: autocast would convert each scene's slice on its own.
-        return for_autocast(self.weight), for_autocast(self.bias)
-
-    def freeze(self, grad: bool = False, goals: Tensor | None = None) -> None:
-        """Converts the weights for autocast now, if it is on."""
-        with torch.set_grad_enabled(grad):
-            weight, bias = self._weights(self.weight)
-        self._frozen = (weight, bias) if grad else (weight.detach(), bias.detach())
-
-    def thaw(self) -> None:
-        """Uses the weights as they are again."""
-        self._frozen = None
+        return [padded_linear(part, weight, bias) for part, weight, bias in parts if len(part)]
 
     def extra_repr(self) -> str:
         """What ``print`` shows of the layer."""

@@ -21,7 +21,7 @@ __all__ = ["PolicyHead", "SuccessorPolicyHead"]
 
 
 class PolicyHead(nn.Module):
-    """One linear layer a scene: hidden state to logits (GVF and USFA).
+    """One linear layer per scene: hidden state to logits (GVF and USFA).
 
     >>> PolicyHead(2, 32, 4)(torch.randn(5, 32), torch.tensor([0, 1, 1, 0, 1])).shape
     torch.Size([5, 4])
@@ -45,12 +45,11 @@ class SuccessorPolicyHead(nn.Module):
         embedding_size: E, size of psi.
         num_actions: A.
         successor_norm: psi grows with the horizon (the sum of about 1 / (1 - gamma) embeddings) and drifts
-            as they do. ``"rms"`` divides it by its root mean square, ``"layer"`` takes its mean away as
-            well, ``None`` leaves it.
-        successor_gain: factor on psi, after that.
+            as they do. ``"layer"`` brings it to mean 0 and deviation 1 over its dimensions, ``None`` leaves
+            it.
         rectify_logits: a ReLU on the logits, as in the released VUSFA.
 
-    >>> head = SuccessorPolicyHead(1, 32, 16, 4, successor_norm="rms")
+    >>> head = SuccessorPolicyHead(1, 32, 16, 4, successor_norm="layer")
     >>> psi = torch.randn(5, 16, requires_grad=True)
     >>> head(torch.randn(5, 32), psi, torch.zeros(5, dtype=torch.int64)).sum().backward()
     >>> psi.grad is None
@@ -64,30 +63,22 @@ class SuccessorPolicyHead(nn.Module):
         embedding_size: int,
         num_actions: int,
         *,
-        successor_norm: Literal["rms", "layer"] | None = None,
-        successor_gain: float = 1.0,
+        successor_norm: Literal["layer"] | None = None,
         rectify_logits: bool = False,
     ) -> None:
         super().__init__()
-        if successor_norm not in (None, "rms", "layer"):
-            raise ConfigError(f"successor_norm is {successor_norm!r}; it must be None, 'rms' or 'layer'")
+        if successor_norm not in (None, "layer"):
+            raise ConfigError(f"successor_norm is {successor_norm!r}; it must be None or 'layer'")
         self.first = SceneLinear(num_scenes, hidden_size + embedding_size, hidden_size)
         self.last = SceneLinear(num_scenes, hidden_size, num_actions)
         self.successor_norm = successor_norm
-        self.successor_gain = successor_gain
         self.rectify_logits = rectify_logits
 
     def forward(self, hidden: Tensor, successor: Tensor, scene_id: RowScenes) -> Tensor:
         """(\\*B, hidden_size), psi (\\*B, E) and scene indices (\\*B,) to logits (\\*B, A) float32."""
-        constant = self._scaled(successor.detach())
+        constant = successor.detach()
+        if self.successor_norm == "layer":
+            constant = functional.layer_norm(constant, constant.shape[-1:], eps=1e-6)
         code = functional.relu(self.first(torch.cat([hidden, constant.to(hidden.dtype)], -1), scene_id))
         logits = self.last(code, scene_id).float()
         return functional.relu(logits) if self.rectify_logits else logits
-
-    def _scaled(self, successor: Tensor) -> Tensor:
-        shape = successor.shape[-1:]
-        if self.successor_norm == "rms":
-            successor = functional.rms_norm(successor, shape, eps=1e-6)
-        elif self.successor_norm == "layer":
-            successor = functional.layer_norm(successor, shape, eps=1e-6)
-        return successor if self.successor_gain == 1.0 else successor * self.successor_gain

@@ -1,8 +1,4 @@
-"""How many rows a layer gets, and how they lie: by scene, in blocks, in numbers that its kernels know.
-
-Layers with weights of their own for each scene want each scene's rows together; kernels of bfloat16 want
-numbers of rows that they have met before.
-"""
+"""Layouts of rows for layers with weights per scene: sorted by scene, or in one block per scene."""
 
 from __future__ import annotations
 
@@ -13,58 +9,13 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from vusfa.modules.freezing import for_autocast
-
-__all__ = ["RowScenes", "SceneBlocks", "SceneRows", "is_steady", "steady_linear", "steady_number"]
+__all__ = ["RowScenes", "SceneBlocks", "SortedByScene"]
 
 #: Rows are laid out in blocks of one size where that makes them at most this many times as many.
 _PADDING = 1.5
 
 
-def steady_number(number: int) -> int:
-    """The next larger one of a few numbers: 16, 32, ... 256, 288, ..., 512, 576, ..., eight to an octave.
-
-    In bfloat16 on a processor every number of rows gets kernels of its own, which take longer to make than to
-    run and stay in memory. Where the number is another one at each call, rows that nobody reads make it one
-    of these few.
-
-    >>> [steady_number(number) for number in (1, 17, 256, 257, 1025)]
-    [16, 32, 256, 288, 1152]
-    """
-    step = max(16, 1 << max(0, number.bit_length() - 4))
-    return number + -number % step
-
-
-def is_steady(rows: Tensor) -> bool:
-    """Whether rows (R, ...) may well be as many as they are: in float32, or on an accelerator."""
-    return rows.is_cuda or for_autocast(rows).dtype != torch.bfloat16
-
-
-def steady_linear(rows: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
-    """``torch.nn.functional.linear``, for numbers of rows that are another one at each call.
-
-    Where that matters rows of zeros are added, see :func:`steady_number`; to what comes out, forwards and
-    backwards, they add nothing.
-
-    Args:
-        rows: (R, in), or with more dimensions, of which no care is taken.
-        weight: (out, in).
-        bias: (out,).
-
-    Returns:
-        (R, out).
-
-    >>> steady_linear(torch.ones(3, 2), torch.ones(1, 2), torch.ones(1)).flatten()
-    tensor([3., 3., 3.])
-    """
-    number = len(rows) if rows.dim() == 2 and not is_steady(rows) else 0
-    missing = steady_number(number) - number
-    if not missing:
-        return functional.linear(rows, weight, bias)
-    return functional.linear(functional.pad(rows, (0, 0, 0, missing)), weight, bias)[:number]
-
-
-class SceneRows(NamedTuple):
+class SortedByScene(NamedTuple):
     """Rows sorted by scene, counted once for all the layers that read them.
 
     Attributes:
@@ -76,15 +27,15 @@ class SceneRows(NamedTuple):
     counts: list[int]
 
     @classmethod
-    def of(cls, scene: Tensor, num_scenes: int) -> SceneRows:
+    def of(cls, scene: Tensor, num_scenes: int) -> SortedByScene:
         """Counts rows whose scenes (R,) ascend."""
         return cls(scene, torch.bincount(scene, minlength=num_scenes).tolist())
 
     @classmethod
-    def sort(cls, scene: Tensor, num_scenes: int) -> tuple[SceneRows, Tensor]:
+    def sort(cls, scene: Tensor, num_scenes: int) -> tuple[SortedByScene, Tensor]:
         """Rows of the scenes (R,) in ascending order, and (R,) int64, which row each of them is.
 
-        >>> rows, order = SceneRows.sort(torch.tensor([1, 0, 1]), 3)
+        >>> rows, order = SortedByScene.sort(torch.tensor([1, 0, 1]), 3)
         >>> rows.scene.tolist(), rows.counts, order.tolist()
         ([0, 1, 1], [1, 2, 0], [1, 0, 2])
         """
@@ -109,11 +60,11 @@ class SceneBlocks(NamedTuple):
     place: Tensor
 
     @classmethod
-    def of(cls, rows: SceneRows, order: Tensor) -> SceneBlocks | None:
-        """Of what :meth:`SceneRows.sort` returns; None where there are no rows, or some scene has so many
+    def of(cls, rows: SortedByScene, order: Tensor) -> SceneBlocks | None:
+        """Of what :meth:`SortedByScene.sort` returns; None where there are no rows, or some scene has so many
         that filling up costs more.
 
-        >>> blocks = SceneBlocks.of(*SceneRows.sort(torch.tensor([1, 0, 1, 0, 1]), 2))
+        >>> blocks = SceneBlocks.of(*SortedByScene.sort(torch.tensor([1, 0, 1, 0, 1]), 2))
         >>> blocks.source.tolist(), blocks.place.tolist()
         ([1, 3, 0, 0, 2, 4], [3, 0, 4, 1, 5])
         """
@@ -138,4 +89,4 @@ class SceneBlocks(NamedTuple):
 
 
 #: Which scene each row is of, and how rows lie: scene indices of rows in any order, or one of the layouts.
-RowScenes: TypeAlias = Tensor | SceneRows | SceneBlocks
+RowScenes: TypeAlias = Tensor | SortedByScene | SceneBlocks

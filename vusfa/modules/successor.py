@@ -10,13 +10,14 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from vusfa.modules.linear import SceneLinear
-from vusfa.modules.rows import RowScenes, steady_linear
+from vusfa.modules.precision import padded_linear
+from vusfa.modules.rows import RowScenes
 
 __all__ = ["RewardHead", "SuccessorHead", "SuccessorValue", "ValueHead"]
 
 
 class SuccessorHead(nn.Module):
-    """psi: one linear layer a scene on the hidden state.
+    """psi: one linear layer per scene on the hidden state.
 
     Args:
         num_scenes: scenes with weights of their own.
@@ -63,8 +64,8 @@ class RewardHead(nn.Module):
 
     def forward(self, goal: Tensor) -> Tensor:
         """Goal embedding, or a sample of it, (\\*B, E) to (\\*B, E) float32."""
-        first = functional.relu(steady_linear(goal, self.first.weight, self.first.bias))
-        return self.scale * steady_linear(first, self.last.weight, self.last.bias).float()
+        first = functional.relu(padded_linear(goal, self.first.weight, self.first.bias))
+        return self.scale * padded_linear(first, self.last.weight, self.last.bias).float()
 
 
 class SuccessorValue(nn.Module):
@@ -81,7 +82,7 @@ class SuccessorValue(nn.Module):
 
 
 class ValueHead(nn.Module):
-    """V of the GVF baseline: one linear layer a scene on the hidden state.
+    """V of the GVF baseline: one linear layer per scene on the hidden state.
 
     >>> import torch
     >>> ValueHead(2, 32)(torch.randn(5, 32), torch.tensor([0, 1, 1, 0, 1])).shape

@@ -2,20 +2,20 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
-
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from vusfa.modules.freezing import Freezable, for_autocast
 from vusfa.modules.linear import SceneLinear
+from vusfa.modules.precision import autocast_copy
 from vusfa.modules.rows import RowScenes
+from vusfa.modules.siamese import SiameseEncoder, joined
+from vusfa.modules.unique import gather
 
-__all__ = ["Fusion", "SceneLayer", "SiameseTrunk"]
+__all__ = ["CachedTrunk", "Fusion", "SceneLayer", "SiameseTrunk"]
 
 
-class Fusion(Freezable):
+class Fusion(nn.Module):
     """Lays the embeddings of state and goal end to end; a dense layer with ReLU, shared by all scenes.
 
     Args:
@@ -30,91 +30,110 @@ class Fusion(Freezable):
     def __init__(self, embedding_size: int, hidden_size: int) -> None:
         super().__init__()
         self.linear = nn.Linear(2 * embedding_size, hidden_size)
-        self._frozen: Tensor | None = None
 
     def forward(self, state_embedding: Tensor, goal_embedding: Tensor) -> Tensor:
         """(\\*B, E) twice to (\\*B, hidden_size)."""
         return functional.relu(self.state_part(state_embedding) + self.goal_part(goal_embedding))
 
     def state_part(self, embedding: Tensor) -> Tensor:
-        """What the state's embedding (\\*B, E) adds to the layer's sums, (\\*B, hidden_size); without the
-        bias."""
-        if self._frozen is not None and not torch.is_grad_enabled():
-            return functional.linear(embedding, self._frozen)
+        """The state's summand (\\*B, hidden_size), from its embedding (\\*B, E), without the bias."""
         return functional.linear(embedding, self.linear.weight[:, : embedding.shape[-1]])
 
     def goal_part(self, embedding: Tensor) -> Tensor:
-        """What the goal's embedding (\\*B, E) adds to them, and the bias, (\\*B, hidden_size)."""
+        """The goal's summand (\\*B, hidden_size), from its embedding (\\*B, E), with the bias."""
         weight = self.linear.weight[:, -embedding.shape[-1] :]
         return functional.linear(embedding, weight, self.linear.bias)
 
-    def freeze(self, grad: bool = False, goals: Tensor | None = None) -> None:
-        """Converts the state's part of the weights for autocast now, for calls without gradients; autocast
-        would convert a part of a weight at every call."""
-        part = self.linear.weight.detach()[:, : self.linear.in_features // 2]
-        self._frozen = for_autocast(part).contiguous()
-
-    def thaw(self) -> None:
-        """Uses the weights as they are again."""
-        self._frozen = None
-
 
 class SiameseTrunk(nn.Module):
-    """The encoder and the fusion of what it gives, as one module.
+    """Encoder and fusion as one module.
 
-    The fusing layer's sum has one part of the state alone and one of the goal alone. So these are computed
-    where the encoder has distinct states and goals at hand, and only their sum row by row.
+    The fusion's sum has one part of the state alone and one of the goal alone. These are computed per
+    distinct state and goal, and only their sum row by row.
 
     Args:
-        encoder: siamese encoder, or one around it, with ``both``.
+        encoder: phi.
         fusion: reads both embeddings.
 
     >>> import torch
     >>> from vusfa.modules.frames import FeatureFrames
-    >>> from vusfa.modules.siamese import SiameseEncoder
     >>> trunk = SiameseTrunk(SiameseEncoder(FeatureFrames(torch.rand(12, 1, 8)), 4, 16, 6), Fusion(6, 32))
     >>> state, goal, fused = trunk(torch.zeros(3, 4, dtype=torch.int64), torch.arange(3))
     >>> torch.allclose(fused, trunk.fusion(state, goal), atol=1e-6)
     True
     """
 
-    def __init__(self, encoder: Any, fusion: Fusion) -> None:
+    def __init__(self, encoder: SiameseEncoder, fusion: Fusion) -> None:
         super().__init__()
         self.encoder = encoder
         self.fusion = fusion
 
     def forward(self, state: Tensor, goal: Tensor) -> tuple[Tensor, ...]:
-        """Embeddings of state and goal, what else the encoder returns, and last the fused (\\*B, hidden)."""
-        of_state, of_goal = self.encoder.both(state, goal, self._heads())
-        (state_embedding, state_part, *rest), (goal_embedding, goal_part, *goal_rest) = of_state, of_goal
-        fused = functional.relu(state_part + goal_part)
-        return state_embedding, goal_embedding, *rest, *goal_rest, fused
+        """What :meth:`SiameseEncoder.forward` returns, and last the fused (\\*B, hidden)."""
+        encoder, fusion, batch = self.encoder, self.fusion, self.encoder.batch_shape(state)
+        states, goals = encoder.first_layer(state, goal)
+        of_state, of_goal = encoder.encode_state(states.values), encoder.encode_goal(goals.values)
+        state_part = gather(fusion.state_part(of_state.embedding), states.index)
+        goal_part = gather(fusion.goal_part(of_goal.embedding), goals.index)
+        fused = functional.relu(state_part + goal_part).view(*batch, -1)
+        return *joined(of_state.gather(states.index, batch), of_goal.gather(goals.index, batch)), fused
 
     def fused(self, state: Tensor, goal: Tensor) -> Tensor:
-        """The fused (\\*B, hidden) alone; nothing else is looked up."""
-        state_part, goal_part = self.encoder.both(state, goal, self._heads(), 1)
+        """The fused (\\*B, hidden) alone: no scale is computed and no embedding looked up."""
+        states, goals = self.encoder.first_layer(state, goal)
+        state_part = gather(self.fusion.state_part(self.encoder.embed_state(states.values)), states.index)
+        goal_part = gather(self.fusion.goal_part(self.encoder.embed_goal(goals.values)), goals.index)
+        return functional.relu(state_part + goal_part).view(*self.encoder.batch_shape(state), -1)
+
+
+class CachedTrunk:
+    """A trunk's ``fused`` while its weights stand still: whatever depends on one frame is computed once.
+
+    Args:
+        trunk: reads ids. Its weights are read now; later changes do not arrive here.
+        goals: (G,) ids of the only states that will be goals; None for all of the world.
+
+    >>> from vusfa.modules.frames import FeatureFrames
+    >>> trunk = SiameseTrunk(SiameseEncoder(FeatureFrames(torch.rand(12, 1, 8)), 4, 16, 6), Fusion(6, 32))
+    >>> state, goal = torch.randint(12, (3, 4)), torch.tensor([1, 7, 7])
+    >>> cached = CachedTrunk(trunk, torch.tensor([7, 1]))
+    >>> torch.allclose(cached.fused(state, goal), trunk.fused(state, goal), atol=1e-6)
+    True
+    """
+
+    @torch.no_grad()
+    def __init__(self, trunk: SiameseTrunk, goals: Tensor | None = None) -> None:
+        encoder, fusion = trunk.encoder, trunk.fusion
+        features, first = encoder.frames.lookup(None), encoder.branch.first
+        self.trunk = autocast_copy(trunk)
+        if encoder.history == 1:  # (S, hidden), per state
+            self.frames = fusion.state_part(encoder.embed_state(first(features.unsqueeze(-2))))
+        else:  # (S, H, hidden), per frame and place
+            self.frames = first.project(features)
+        self.row: Tensor | None = None
+        if goals is not None:
+            # -1 where a state is no goal: looking it up fails, and does not mistake it for another one
+            self.row = torch.full((len(features),), -1, dtype=torch.int64, device=features.device)
+            self.row[goals] = torch.arange(len(goals), device=features.device)
+            features = features[goals]
+        goal_first = (encoder.goal_branch or encoder.branch).first.repeated(features)
+        self.goals = fusion.goal_part(encoder.embed_goal(goal_first))  # (G, hidden)
+
+    @torch.no_grad()
+    def fused(self, state: Tensor, goal: Tensor) -> Tensor:
+        """(R, hidden) of ids (R, H) and (R,)."""
+        encoder, fusion = self.trunk.encoder, self.trunk.fusion
+        goal_part = gather(self.goals, goal if self.row is None else self.row[goal])
+        if encoder.history == 1:
+            state_part = gather(self.frames, state[:, -1])
+        else:
+            sums = encoder.branch.first.gather(self.frames, state[:, -encoder.history :])
+            state_part = fusion.state_part(encoder.embed_state(sums))
         return functional.relu(state_part + goal_part)
-
-    def _heads(self) -> tuple[_Fused, _Fused]:
-        return _Fused(self.fusion, "state_part"), _Fused(self.fusion, "goal_part")
-
-
-class _Fused(NamedTuple):
-    """Embeddings to themselves and their part of the fusion; equal to another one that does the same."""
-
-    fusion: Fusion
-    part: str
-
-    def __call__(self, embedding: Tensor) -> tuple[Tensor, Tensor]:
-        return embedding, getattr(self.fusion, self.part)(embedding)
-
-    @property
-    def parts(self) -> int:
-        return 2
 
 
 class SceneLayer(nn.Module):
-    """A dense layer with ReLU, one a scene.
+    """A dense layer with ReLU, one per scene.
 
     Args:
         num_scenes: scenes with weights of their own.

@@ -19,6 +19,8 @@ import torch
 from torch import Tensor
 from torch.autograd.function import FunctionCtx
 
+from vusfa.modules.bottleneck import gaussian_kl
+
 __all__ = [
     "dual_ascent",
     "explained_variance",
@@ -249,36 +251,6 @@ def policy_gradient_loss(log_prob: Tensor, advantage: Tensor) -> Tensor:
     """
     _assert_same_shape(policy_gradient_loss, log_prob=log_prob, advantage=advantage)
     return -log_prob * advantage.detach()
-
-
-def gaussian_kl(loc: Tensor, scale: Tensor, eps: float = 1e-8) -> Tensor:
-    r"""Divergence of N(loc, scale^2) from N(0, 1), elementwise, in nats.
-
-    .. math::
-        \tfrac12 \left(\mu^2 + \sigma^2 - \log(\sigma^2 + \epsilon) - 1\right)
-
-    Only the scale's square counts, so that a network's plain linear output, of either sign, may be the scale.
-
-    Args:
-        loc: mean, any shape.
-        scale: standard deviation, the same shape.
-        eps: keeps the logarithm finite at scale 0.
-
-    Returns:
-        the shape of ``loc``.
-
-    Raises:
-        ValueError: when the shapes differ.
-
-    >>> gaussian_kl(torch.tensor([0.0, 2.0]), torch.tensor([1.0, -1.0]))
-    tensor([0., 2.])
-    """
-    _assert_same_shape(gaussian_kl, loc=loc, scale=scale)
-    if loc.dtype in (torch.bfloat16, torch.float16):
-        # eps and the difference of near-equal numbers need more digits, as under autocast
-        loc, scale = loc.float(), scale.float()
-    variance = scale.square()
-    return 0.5 * (loc.square() + variance - torch.log(variance + eps) - 1.0)
 
 
 def information_bottleneck(kl: Tensor, beta: float | Tensor, information_target: float | Tensor) -> Tensor:

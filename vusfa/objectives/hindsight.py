@@ -22,7 +22,7 @@ from torch import Tensor
 from torchrl.objectives import LossModule
 
 from vusfa.objectives.distribution import action_log_prob
-from vusfa.objectives.single_pass import Memory, run_actor, run_critic
+from vusfa.objectives.networks import run_actor_critic, run_critic, select_inputs
 
 __all__ = ["HindsightKeys", "HindsightLoss", "expectile_loss", "relabelled_target", "walked_return"]
 
@@ -214,16 +214,15 @@ class HindsightLoss(LossModule):
         Returns:
             scalars, see the class.
         """
-        keys, memory = self.tensor_keys, Memory()
+        keys = self.tensor_keys
         actor, critic = self.actor_network, self.critic_network
-        distribution = run_actor(actor, tensordict.select(*actor.in_keys), memory)
-        value = (
-            run_critic(critic, tensordict.select(*critic.in_keys), memory).get(keys.value).squeeze(-1).float()
-        )
+        inputs = select_inputs(tensordict, *actor.in_keys, *critic.in_keys)
+        distribution, written = run_actor_critic(actor, critic, inputs)
+        value = self._value(written)
         following, goal = tensordict.get(("next", keys.state)), tensordict.get(keys.goal)
         with torch.no_grad():
             after = tensordict.select(*critic.in_keys).set(keys.state, following)
-            next_value = self._value(after, Memory())
+            next_value = self._value(run_critic(critic, after))
             rewards = {"goal_reward": self.goal_reward, "step_reward": self.step_reward}
             target = relabelled_target(next_value, following[..., -1] == goal, self.gamma, **rewards)
             walked = walked_return(tensordict.get(keys.steps_to_goal), self.gamma, **rewards)
@@ -245,6 +244,6 @@ class HindsightLoss(LossModule):
             batch_size=[],
         )
 
-    def _value(self, inputs: TensorDictBase, memory: Memory) -> Tensor:
+    def _value(self, written: TensorDictBase) -> Tensor:
         """V, (*batch,), float32."""
-        return run_critic(self.critic_network, inputs, memory).get(self.tensor_keys.value).squeeze(-1).float()
+        return written.get(self.tensor_keys.value).squeeze(-1).float()

@@ -21,7 +21,7 @@ from torch import Tensor
 from torchrl.modules import set_recurrent_mode
 from torchrl.objectives.value import ValueEstimatorBase
 
-from vusfa.objectives.distinct import spread
+from vusfa.modules.unique import gather
 from vusfa.objectives.functional import lambda_return, n_step_return
 from vusfa.objectives.keys import EstimatorKeys
 
@@ -305,7 +305,7 @@ def evaluate_rollout(
     next_rows[rows] = torch.arange(known_rows, known_rows + len(rows), device=rows.device)
 
     def taken(key: NestedKey, places: Tensor) -> Tensor:
-        return spread(values[key], places.view(shape))
+        return gather(values[key], places.view(shape))
 
     def whole(key: NestedKey) -> Tensor:
         return values[key][:steps].reshape(*shape, *values[key].shape[1:])

@@ -19,18 +19,24 @@ from torch.distributions import Distribution
 from torchrl.objectives.common import LossModule
 from torchrl.objectives.utils import ValueEstimators, distance_loss
 
-from vusfa.objectives.distinct import distinct_rows, spread
+from vusfa.modules.bottleneck import gaussian_kl
+from vusfa.modules.unique import gather
 from vusfa.objectives.distribution import action_entropy, action_log_prob
 from vusfa.objectives.functional import (
     explained_variance,
-    gaussian_kl,
     information_bottleneck,
     policy_gradient_loss,
     successor_loss,
 )
 from vusfa.objectives.keys import LossKeys
+from vusfa.objectives.networks import (
+    ends_in_distribution,
+    run_actor_critic,
+    run_critic,
+    select_inputs,
+    unique_inputs,
+)
 from vusfa.objectives.returns import USFEstimator
-from vusfa.objectives.single_pass import Memory, ends_in_distribution, run_actor, run_critic, select_inputs
 
 __all__ = ["USFLoss"]
 
@@ -74,7 +80,7 @@ class USFLoss(LossModule):
 
     with the targets of :class:`~vusfa.objectives.USFEstimator`, which are constants: the policy's gradient
     enters nothing but the policy (and whatever of the critic's modules the actor holds), the value's flows
-    into successor features, reward weights and trunk. KL is :func:`~vusfa.objectives.functional.gaussian_kl`,
+    into successor features, reward weights and trunk. KL is :func:`~vusfa.modules.gaussian_kl`,
     averaged over the latent's features and over the branches named by ``bottleneck_on``. A term whose
     coefficient is ``None``, or whose entries the critic does not write, is left out; so this is a plain
     advantage actor-critic loss for a critic that writes a value only.
@@ -103,7 +109,7 @@ class USFLoss(LossModule):
             What only successor features and the bottleneck train must then not be shared. Needs
             ``functional=True``.
         distinct: where the networks read ids alone, rows that read the same go through them once
-            (:func:`~vusfa.objectives.distinct.distinct_rows`). Equal rows then share the noise of a latent
+            (:func:`~vusfa.modules.unique_rows`). Equal rows then share the noise of a latent
             that is sampled: the mean of the loss is the same. Without effect with ``separate_losses``.
 
     Each term is a method as well. It takes steps with their targets and returns their weighted terms;
@@ -416,19 +422,21 @@ class USFLoss(LossModule):
     def _evaluate(self, tensordict: TensorDictBase) -> Results:
         actor, critic = self.actor_network, self.critic_network
         inputs = select_inputs(tensordict, *actor.in_keys, *critic.in_keys)
-        memory, index = Memory(), None
-        found = distinct_rows(inputs) if self.distinct else None
+        index = None
+        found = unique_inputs(inputs) if self.distinct else None
         if found is not None:
             inputs, index = found
-        with self._params_of("actor_network"):
-            distribution = run_actor(actor, inputs.select(*actor.in_keys, strict=False), memory, index)
         if self.separate_losses:
             # what both hold is a constant to the critic: its modules run again, on detached parameters
-            memory = Memory()
-        with self._params_of("critic_network"):
-            written = run_critic(critic, inputs.select(*critic.in_keys, strict=False), memory)
+            with self._params_of("actor_network"):
+                distribution = actor.get_dist(inputs.select(*actor.in_keys, strict=False))
+            with self._params_of("critic_network"):
+                written = run_critic(critic, inputs)
+        else:
+            with self._params_of("actor_network"), self._params_of("critic_network"):
+                distribution, written = run_actor_critic(actor, critic, inputs, index)
         if index is not None:
-            each = {key: spread(written.get(key), index) for key in self._read()}
+            each = {key: gather(written.get(key), index) for key in self._read()}
             sizes = [written.get(loc).shape[-1] for loc, *_ in self._branches()]
             latent_size = sizes[0] if sizes else 0
             return Results(distribution, TensorDict(each, index.shape), latent_size, written, index)

@@ -9,7 +9,7 @@ from typing import Any
 
 from vusfa.errors import ConfigError
 from vusfa.experiments import runs as results
-from vusfa.modules.presets import MODELS
+from vusfa.modules.config import MODELS
 from vusfa.report.curve import read_metrics
 from vusfa.report.runs import LoggedRun, read_run, split_name
 

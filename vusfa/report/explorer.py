@@ -18,7 +18,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from vusfa.envs.dynamics import MAX_STEPS, start_history
 from vusfa.evaluation import trails
 from vusfa.evaluation.navigation import Observe
-from vusfa.modules import Agent, frozen
+from vusfa.modules import Agent
 from vusfa.scenes import Scene, SceneSet
 from vusfa.scenes.poses import spread_poses
 from vusfa.training import make_observation
@@ -78,7 +78,7 @@ def state_maps(
     state = scenes.global_id(scene, local)
     goal = scenes.global_id(scene, torch.tensor(goals, device=device)).repeat_interleave(num_states)
     parts: dict[str, list[Tensor]] = {"value": [], "probabilities": [], "psi": []}
-    with frozen(agent), set_exploration_type(ExplorationType.DETERMINISTIC):
+    with set_exploration_type(ExplorationType.DETERMINISTIC):
         for rows in torch.arange(len(state), device=device).split(_ROWS):
             batch = _standing(scenes, state[rows], goal[rows], agent.config["history"], observe)
             probabilities = actor.get_dist(batch.clone(recurse=False)).probs

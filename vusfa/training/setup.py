@@ -2,21 +2,18 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import Any
 
 import torch
 from tensordict.nn import TensorDictModuleBase
-from torch import Tensor
 from torchrl.collectors import BaseCollector
 
-from vusfa.algorithms import Algorithm, make_algorithm
+from vusfa.algorithms import make_algorithm
 from vusfa.envs import SceneObservation, resolve_goals
 from vusfa.errors import ConfigError
-from vusfa.modules import Agent, StateGoalPairs, make_agent, sees_one_frame
-from vusfa.modules.presets import AgentConfig
+from vusfa.modules import Agent, make_agent
 from vusfa.scenes import SceneSet
 from vusfa.training.collectors import check_goals_dealt, make_collector, make_env
 from vusfa.training.memory import keep_memory
@@ -26,9 +23,6 @@ from vusfa.training.trainer import Trainer
 from vusfa.training.upgrade import upgrade_config
 
 __all__ = ["make_observation", "make_trainer", "row_name", "set_threads", "torch_device"]
-
-#: Pairs of state and goal per frame of a batch, up to which an agent's answers are tabulated.
-PAIRS_PER_FRAME = 3
 
 
 def make_trainer(
@@ -49,7 +43,8 @@ def make_trainer(
     scenes = SceneSet.open(settings["scenes"]) if scenes is None else scenes
     goals = resolve_goals(scenes, settings["env"]["goals"])
     check_goals_dealt(len(goals), settings["collector"]["num_envs"], settings["env"]["goal_sampling"])
-    agent = make_agent(scenes=scenes, **_given(settings["agent"])).to(device)
+    chosen = {key: value for key, value in settings["agent"].items() if value is not None}
+    agent = make_agent(scenes=scenes, **chosen).to(device)
     algorithm = make_algorithm(settings["algorithm"]["name"], agent, scenes, settings)
     optimizer = make_optimizer(
         algorithm.parameters(), optim["kind"], optim["lr"], optim["max_grad_norm"], **optim["options"]
@@ -79,34 +74,8 @@ def make_trainer(
         settings,
         overrides,
         observation=observation,
-        pairs=_pairs(settings, agent, algorithm, goals),
         note=note,
     )
-
-
-def _pairs(
-    settings: Mapping[str, Any], agent: Agent, algorithm: Algorithm, goals: Tensor
-) -> StateGoalPairs | None:
-    """What a collector may ask, where tabulating all answers before each batch is cheaper: for an agent of
-    one frame in one process, and no more than :data:`PAIRS_PER_FRAME` pairs per frame of a batch; else None.
-
-    A pair in a product of thousands costs a fraction of what it costs in a step's product of 64.
-    """
-    collector = settings["collector"]
-    if not sees_one_frame(agent) or collector["kind"] != "single" or algorithm.relabels_goals:
-        return None
-    pairs = StateGoalPairs(algorithm.scenes, goals)
-    frames = collector["num_envs"] * collector["rollout"]
-    return pairs if len(pairs) <= PAIRS_PER_FRAME * frames else None
-
-
-def _given(agent: Mapping[str, Any]) -> dict[str, Any]:
-    """Arguments of make_agent, without those that the architecture decides on."""
-    given = {key: value for key, value in agent.items() if value is not None}
-    fields = {field.name for field in dataclasses.fields(AgentConfig)}
-    old = {"architecture": "preset", "normalize_features": "normalise_features"}
-    old |= {"normalize_embedding": "normalise_embedding"}
-    return {key if key in fields else old.get(key, key): value for key, value in given.items()}
 
 
 def make_observation(agent: Agent, scenes: SceneSet, crop: str = "first") -> SceneObservation | None:

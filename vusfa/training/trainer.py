@@ -23,7 +23,7 @@ from torchrl.collectors import BaseCollector, Collector
 from vusfa.algorithms import Algorithm, annealed
 from vusfa.envs import SceneObservation
 from vusfa.errors import CheckpointError, VusfaError
-from vusfa.modules import ActingPolicy, Agent, StateGoalPairs, frozen
+from vusfa.modules import Agent, InferencePolicy
 from vusfa.scenes import SceneSet
 from vusfa.training.checkpoint import (
     check_fits,
@@ -61,8 +61,6 @@ class Trainer:
         settings: all settings, plain.
         overrides: the command line that made them; kept in checkpoints.
         observation: transform between world and agent, or None.
-        pairs: everything that the collector may ask the policy, if its answers are to be tabulated before
-            each batch; None to compute them step by step.
         note: what the algorithm's preparation has to say, or None.
 
     Attributes:
@@ -86,15 +84,14 @@ class Trainer:
         settings: Mapping[str, Any],
         overrides: Sequence[str] = (),
         observation: SceneObservation | None = None,
-        pairs: StateGoalPairs | None = None,
         note: str | None = None,
     ) -> None:
         self.scenes, self.goals, self.agent = scenes, goals, agent
         self.algorithm, self.optimizer = algorithm, optimizer
         self.settings, self.overrides = settings, overrides
-        self.observation, self.pairs, self.note = observation, pairs, note
+        self.observation, self.note = observation, note
         self.actor = agent.get_policy_operator(out_keys=["action"])
-        self.acting = None if agent.memory is not None else ActingPolicy(agent)
+        self.acting = None if agent.memory is not None else InferencePolicy(agent)
         self._make_collector = partial(make_collector, self.actor if self.acting is None else self.acting)
         self.frames, self.updates, self.seconds = 0, 0, 0.0
         self.run_id = secrets.token_hex(4)
@@ -118,9 +115,18 @@ class Trainer:
                 self._collector = None
 
     def collect(self, batches: Iterator[TensorDictBase]) -> TensorDictBase:
-        """The collector's next batch, without an update."""
-        with self._encoded_once():
-            return self._next(batches)
+        """The collector's next batch, without an update.
+
+        The policy's answers are of the weights on entry, and what they share is computed once. Where a batch
+        has less than half as many frames as the world has states, computing step by step is cheaper; a
+        collector's workers do so, too.
+        """
+        collector = self._collector
+        frames = collector.requested_frames_per_batch if isinstance(collector, Collector) else 0
+        with self._precision(), ExitStack() as stack:
+            if self.acting is not None and 2 * frames >= self.scenes.num_states:
+                stack.enter_context(self.acting.cached(self.goals, self.scenes, frames))
+            return next(batches)
 
     def update(self, batches: Iterator[TensorDictBase]) -> tuple[TensorDictBase, dict[str, Tensor]]:
         """One update, counted.
@@ -139,20 +145,14 @@ class Trainer:
             max_grad_norm=optim["max_grad_norm"],
         )
         self.algorithm.schedule(self.frames)
-        with self._encoded_once():
-            batch = self._next(batches)
-            with self._precision():  # another one: autocast keeps weights that it converted without gradients
-                terms = dict(self.algorithm.losses(batch))
-            total = total_loss(terms)
-        norm = step(total)
+        batch = self.collect(batches)
+        with self._precision():  # another one: autocast keeps weights that it converted without gradients
+            terms = dict(self.algorithm.losses(batch))
+        norm = step(total_loss(terms))
         for _ in range(self.algorithm.replay_steps):
-            with ExitStack() as stack:
-                with self._precision():
-                    stack.enter_context(frozen(self.agent, grad=True))
-                with self._precision():
-                    more = self.algorithm.replay_losses()
-                total = total_loss(more)
-            step(total)
+            with self._precision():
+                more = self.algorithm.replay_losses()
+            step(total_loss(more))
             terms.update(more)
         self.algorithm.after_step()
         terms["grad_norm"] = norm
@@ -279,28 +279,6 @@ class Trainer:
         device = next(self.agent.parameters()).device
         enabled = resolve_autocast(self.settings["autocast"], device)
         return torch.autocast(device.type, torch.bfloat16, enabled=enabled)
-
-    def _next(self, batches: Iterator[TensorDictBase]) -> TensorDictBase:
-        with self._precision(), ExitStack() as stack:
-            if self.acting is not None and self.pairs is not None:
-                stack.enter_context(self.acting.tabulated(self.pairs))
-            return next(batches)
-
-    @contextmanager
-    def _encoded_once(self) -> Iterator[None]:
-        """The whole world is encoded on the way in; collecting and the losses look it up.
-
-        Where a batch has less than half as many frames as the world has states, encoding the batch's states
-        as they come is cheaper; so it is with a collector's workers.
-        """
-        collector = self._collector
-        frames = collector.requested_frames_per_batch if isinstance(collector, Collector) else 0
-        with ExitStack() as stack:
-            if 2 * frames >= self.scenes.num_states:
-                goals = None if self.algorithm.relabels_goals else self.goals
-                with self._precision():
-                    stack.enter_context(frozen(self.agent, grad=True, goals=goals))
-            yield
 
     @torch.no_grad()
     def _check_weights(self) -> None:

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from vusfa.errors import CheckpointError
+from vusfa.modules import upgrade_agent_config, upgrade_agent_state
 
 __all__ = ["upgrade", "upgrade_config"]
 
@@ -38,6 +39,8 @@ def upgrade(state: Mapping[str, Any]) -> dict[str, Any]:
         algorithm["replay"] = replay
     new |= {"format": 2, "algorithm": algorithm, "optimizer": state.get("optimiser", {})}
     new["config"] = upgrade_config(state.get("config", {}))
+    new["agent"] = upgrade_agent_state(state["agent"], state["agent_config"])
+    new["agent_config"] = upgrade_agent_config(state["agent_config"])
     return new
 
 

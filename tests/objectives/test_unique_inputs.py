@@ -8,9 +8,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from tensordict import TensorDict
 
-from vusfa.modules import make_agent
+from vusfa.modules import gather, make_agent
 from vusfa.objectives import USFEstimator, USFLoss
-from vusfa.objectives.distinct import distinct_rows, spread
+from vusfa.objectives.networks import unique_inputs
 from vusfa.scenes import SceneSet
 
 
@@ -22,7 +22,7 @@ from vusfa.scenes import SceneSet
 def test_each_row_finds_itself(rows: list[tuple[int, int, int]]) -> None:
     state, goal, scene = torch.tensor(rows).unbind(-1)
     ids = TensorDict({"state_id": state.unsqueeze(-1), "goal_id": goal, "scene_id": scene}, [len(rows)])
-    found = distinct_rows(ids)
+    found = unique_inputs(ids)
     assert found is not None
     different, index = found
     assert len(different) == len(set(rows))
@@ -30,16 +30,16 @@ def test_each_row_finds_itself(rows: list[tuple[int, int, int]]) -> None:
 
 
 def test_what_is_not_worth_it_or_no_id() -> None:
-    assert distinct_rows(TensorDict({"state_id": torch.arange(8)}, [8])) is None
-    assert distinct_rows(TensorDict({"observation": torch.zeros(8, 1)}, [8])) is None
-    assert distinct_rows(TensorDict({"state_id": torch.zeros(8, 4, dtype=torch.int64)}, [8])) is None
-    assert distinct_rows(TensorDict({}, [8])) is None
+    assert unique_inputs(TensorDict({"state_id": torch.arange(8)}, [8])) is None
+    assert unique_inputs(TensorDict({"observation": torch.zeros(8, 1)}, [8])) is None
+    assert unique_inputs(TensorDict({"state_id": torch.zeros(8, 4, dtype=torch.int64)}, [8])) is None
+    assert unique_inputs(TensorDict({}, [8])) is None
 
 
 @pytest.mark.parametrize("shape", [(3, 2), (3,), (3, 2, 2)])
-def test_spread_is_indexing(shape: tuple[int, ...]) -> None:
+def test_gather_is_indexing(shape: tuple[int, ...]) -> None:
     values, index = torch.randn(shape), torch.tensor([[0, 2], [2, 1]])
-    assert torch.equal(spread(values, index), values[index])
+    assert torch.equal(gather(values, index), values[index])
 
 
 def rollout(rows: int = 6, time: int = 20) -> TensorDict:
@@ -100,3 +100,20 @@ def test_equal_rows_go_through_the_networks_once() -> None:
     loss(batch)
     pairs = torch.stack([batch["state_id"].squeeze(-1), batch["goal_id"]]).flatten(1).unique(dim=1)
     assert seen[0] == pairs.shape[1] <= 14
+
+
+def test_several_epochs_on_one_batch() -> None:
+    """Nothing is kept from one pass to the next: each encodes the batch with the weights as they are."""
+    torch.manual_seed(0)
+    agent = make_agent("usfa", scenes=SceneSet.bundled(["bathroom"]), history=1, hidden_size=16)
+    critic = agent.get_value_operator()
+    loss, batch = USFLoss(agent.get_policy_operator(), critic, distinct=True), rollout()
+    USFEstimator(value_network=critic)(batch)
+    optimizer, totals = torch.optim.SGD(agent.parameters(), lr=1e-3), []
+    for _ in range(2):
+        optimizer.zero_grad()
+        total = sum(value for key, value in loss(batch).items() if key.startswith("loss_"))
+        total.backward()
+        totals.append(total.item())
+        optimizer.step()
+    assert totals[1] < totals[0]

@@ -15,15 +15,13 @@ from tensordict.nn import TensorDictModule as Mod
 from torch import nn
 from torchrl.modules import ActorValueOperator, ProbabilisticActor, ValueOperator
 
-from vusfa.objectives.single_pass import Memory, flatten, run_actor, run_critic, select_inputs
+from vusfa.objectives.networks import flatten, run_actor_critic, run_critic, select_inputs
 
 
 def run(
     actor: nn.Module, critic: nn.Module, td: TensorDict
 ) -> tuple[torch.distributions.Distribution, TensorDict]:
-    inputs, memory = select_inputs(td, *actor.in_keys, *critic.in_keys), Memory()
-    dist = run_actor(actor, inputs.select(*actor.in_keys, strict=False), memory)
-    return dist, run_critic(critic, inputs.select(*critic.in_keys, strict=False), memory)
+    return run_actor_critic(actor, critic, select_inputs(td, *actor.in_keys, *critic.in_keys))
 
 
 class TestSharing:
@@ -159,10 +157,8 @@ class TestFlatten:
             return td.set("x", 3 * td["x"])
 
         critic = TensorDictSequential(WrapModule(triple), self.a)
-        td, memory = TensorDict({"x": torch.ones(2)}, [2]), Memory()
-        run_critic(critic, td.clone(), memory)
-        written = run_critic(critic, td.clone(), memory)
-        assert len(calls) == 2
+        written = run_critic(critic, TensorDict({"x": torch.ones(2)}, [2]))
+        assert len(calls) == 1
         assert written["y"].tolist() == [3.0, 3.0]
 
 

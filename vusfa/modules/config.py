@@ -1,19 +1,26 @@
-"""What the four models are, and what the three presets make of the rest: two tables and the class they fill.
+"""Models and architectures: two tables, and the class of settings that they fill.
 
-The models differ in three named ideas (:data:`MODELS`). Everything else is a field of
-:class:`AgentConfig`, which a preset sets (:data:`PRESETS`) and ``make_agent(..., field=value)`` overrides.
+Models differ in three named ideas (:data:`MODELS`). Everything else is a field of :class:`AgentConfig`, which
+an architecture sets (:data:`ARCHITECTURES`) and ``make_agent(..., field=value)`` overrides.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import difflib
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from typing import Any, Literal, NamedTuple
 
 from vusfa.errors import ConfigError
 
-__all__ = ["MODELS", "PRESETS", "AgentConfig", "Model", "resolve_config"]
+__all__ = [
+    "ARCHITECTURES",
+    "MODELS",
+    "AgentConfig",
+    "Model",
+    "register_model",
+    "resolve_config",
+]
 
 
 class Model(NamedTuple):
@@ -23,14 +30,17 @@ class Model(NamedTuple):
         successor_value: V = psi . omega instead of a linear value head.
         successor_policy: SFDP: the policy reads (detached) psi too.
         bottleneck: embeddings are Gaussians, omega reads a sample of the goal's.
+        agent: what builds it from its configuration and scenes, a subclass of
+            :class:`~vusfa.modules.Agent`; None for that class itself.
     """
 
     successor_value: bool
     successor_policy: bool
     bottleneck: bool
+    agent: Callable[[AgentConfig, Any], Any] | None = None
 
 
-#: The four models of the paper's Table 1.
+#: The four models of the paper's Table 1, and those of :func:`register_model`.
 MODELS: dict[str, Model] = {
     #             psi . omega  SFDP   bottleneck
     "gvf": Model(False, False, False),
@@ -39,15 +49,15 @@ MODELS: dict[str, Model] = {
     "vusfa": Model(True, True, True),
 }
 
-#: What a preset sets, for all models (``"*"``) and then for one. What it leaves out has AgentConfig's
+#: What an architecture sets, for all models (``"*"``) and then for one. What it leaves out has AgentConfig's
 #: default.
-PRESETS: dict[str, dict[str, dict[str, Any]]] = {
+ARCHITECTURES: dict[str, dict[str, dict[str, Any]]] = {
     # The four models differ only in the ideas of MODELS, so that an ablation means something.
     # The five settings below are none of the paper's: with them all four models learn (docs/training.md).
     "controlled": {
         "*": {
-            "normalise_features": True,
-            "normalise_embedding": True,
+            "normalize_features": True,
+            "normalize_embedding": True,
             "successor_norm": "layer",
             "successor_scale": 100.0,
             "reward_scale": 1e-3,
@@ -67,12 +77,11 @@ PRESETS: dict[str, dict[str, dict[str, Any]]] = {
     },
 }
 
-#: Fields that neither the paper nor its code knows: changing them would make those presets a lie.
+#: Fields that neither the paper nor its code knows: changing them would make those architectures a lie.
 _OURS_ALONE = (
-    "normalise_features",
-    "normalise_embedding",
+    "normalize_features",
+    "normalize_embedding",
     "successor_norm",
-    "successor_gain",
     "successor_scale",
     "reward_scale",
     "initial_scale",
@@ -86,8 +95,8 @@ class AgentConfig:
     """All that shapes an agent, besides its scenes.
 
     Attributes:
-        model: ``"gvf"``, ``"usfa"``, ``"sfdp"`` or ``"vusfa"``, see :data:`MODELS`.
-        preset: ``"controlled"``, ``"paper"`` or ``"reference"``, see :data:`PRESETS`.
+        model: a name of :data:`MODELS`.
+        architecture: ``"controlled"``, ``"paper"`` or ``"reference"``, see :data:`ARCHITECTURES`.
         history: frames H that the encoder reads. 1 with ``memory="lstm"`` unless given.
         embedding_size: E, size of phi, psi and omega.
         hidden_size: outputs of every other layer.
@@ -96,8 +105,8 @@ class AgentConfig:
         encoder: ``"mlp"`` on precomputed features, or ``"conv"``: three convolutions on pictures. Fixed by
             ``observation`` unless that is ``"index"``.
         picture_size: height and width that the convolutions see, pixels.
-        normalise_features: bring each feature to mean 0, deviation 1 over the scenes' states.
-        normalise_embedding: bring phi to mean 0, deviation 1 over its dimensions.
+        normalize_features: bring each feature to mean 0, deviation 1 over the scenes' states.
+        normalize_embedding: bring phi to mean 0, deviation 1 over its dimensions.
         shared_encoder: state and goal go through the same weights (siamese).
         embedding_layer: a linear layer behind the encoder's first; without it E must equal ``hidden_size``.
         state_layer: one more dense layer in the state's branch alone.
@@ -106,8 +115,8 @@ class AgentConfig:
             and do not read which scene it is; :func:`~vusfa.modules.transplant` takes it to others.
         pretrained: ``"autoencoder"``: the encoder's weights are constants, made by
             :func:`~vusfa.modules.pretrain_autoencoder`.
-        successor_norm: how psi is normalised on its way into the policy: ``None``, ``"rms"``, ``"layer"``.
-        successor_gain: factor on psi on that way.
+        successor_norm: ``"layer"`` brings psi to mean 0, deviation 1 over its dimensions on its way into the
+            policy; ``None`` leaves it.
         successor_scale: factor on the psi layer's output, about 1 / (1 - gamma).
         reward_scale: factor on the omega layer's output.
         rectify_logits: a ReLU on the logits.
@@ -117,23 +126,22 @@ class AgentConfig:
     """
 
     model: str
-    preset: str = "controlled"
+    architecture: str = "controlled"
     history: int = 4
     embedding_size: int = 512
     hidden_size: int = 512
     observation: Literal["index", "features", "pixels"] = "index"
     encoder: Literal["mlp", "conv"] = "mlp"
     picture_size: tuple[int, int] = (60, 80)
-    normalise_features: bool = False
-    normalise_embedding: bool = False
+    normalize_features: bool = False
+    normalize_embedding: bool = False
     shared_encoder: bool = True
     embedding_layer: bool = True
     state_layer: bool = False
     memory: Literal["lstm"] | None = None
     shared_heads: bool = False
     pretrained: Literal["autoencoder"] | None = None
-    successor_norm: Literal["rms", "layer"] | None = None
-    successor_gain: float = 1.0
+    successor_norm: Literal["layer"] | None = None
     successor_scale: float = 1.0
     reward_scale: float = 1.0
     rectify_logits: bool = False
@@ -147,12 +155,32 @@ class AgentConfig:
         return MODELS[self.model]
 
 
-def resolve_config(model: str, preset: str = "controlled", **overrides: Any) -> AgentConfig:
-    """The configuration of a model in a preset, with fields overridden.
+def register_model(name: str, model: Model) -> Model:
+    """Add a model to :data:`MODELS`, under a name that ``make_agent`` and the setting ``agent.model`` take.
+
+    Args:
+        name: not taken yet.
+        model: its ideas, and the agent class that builds it.
 
     Raises:
-        ConfigError: an unknown model, preset, field or value, naming it and what comes near; fields that
-            contradict each other; a field that the paper's presets do not have.
+        ConfigError: the name is taken by another model.
+
+    >>> _ = register_model("usfa again", Model(True, False, False))
+    >>> MODELS.pop("usfa again").successor_value
+    True
+    """
+    if MODELS.get(name, model) != model:
+        raise ConfigError(f"there is a model {name!r} already; register yours under another name")
+    MODELS[name] = model
+    return model
+
+
+def resolve_config(model: str, architecture: str = "controlled", **overrides: Any) -> AgentConfig:
+    """The configuration of a model in an architecture, with fields overridden.
+
+    Raises:
+        ConfigError: an unknown model, architecture, field or value, naming it and what comes near; fields
+            that contradict each other; a field that the paper's architectures do not have.
 
     >>> config = resolve_config("vusfa", "reference")
     >>> config.history, config.scale, config.state_layer
@@ -163,28 +191,29 @@ def resolve_config(model: str, preset: str = "controlled", **overrides: Any) -> 
     vusfa.errors.ConfigError: make_agent knows no field 'histroy'; did you mean 'history'?
     """
     _check_choice("model", model, MODELS)
-    _check_choice("preset", preset, PRESETS)
+    _check_choice("architecture", architecture, ARCHITECTURES)
     fields = [field.name for field in dataclasses.fields(AgentConfig)][2:]
     for name in overrides:
         if name not in fields:
             raise ConfigError(f"make_agent knows no field {name!r}; {_near(name, fields)}")
-    settings = {**PRESETS[preset]["*"], **PRESETS[preset].get(model, {})}
-    if preset != "controlled":
+    settings = {**ARCHITECTURES[architecture]["*"], **ARCHITECTURES[architecture].get(model, {})}
+    if architecture != "controlled":
         for name in _OURS_ALONE:
             if overrides.get(name, settings.get(name, _default(name))) != settings.get(name, _default(name)):
                 raise ConfigError(
-                    f"{name} is no part of preset {preset!r}; use preset='controlled' to change it"
+                    f"{name} is no part of architecture {architecture!r}; use architecture='controlled' to"
+                    " change it"
                 )
     if overrides.get("observation", "index") == "pixels":
         settings["encoder"] = "conv"
     if overrides.get("encoder", settings.get("encoder")) == "conv":
-        settings["normalise_features"] = False  # it has none; asking for it is refused below
+        settings["normalize_features"] = False  # it has none; asking for it is refused below
     if overrides.get("memory") is not None:
         settings["history"] = 1
     settings.update(overrides)
     if "picture_size" in settings:
         settings["picture_size"] = _two_sides(settings["picture_size"])
-    return _checked(AgentConfig(model=model, preset=preset, **settings))
+    return _checked(AgentConfig(model=model, architecture=architecture, **settings))
 
 
 def _checked(config: AgentConfig) -> AgentConfig:
@@ -193,7 +222,7 @@ def _checked(config: AgentConfig) -> AgentConfig:
         ("encoder", ("mlp", "conv")),
         ("memory", (None, "lstm")),
         ("pretrained", (None, "autoencoder")),
-        ("successor_norm", (None, "rms", "layer")),
+        ("successor_norm", (None, "layer")),
         ("scale", ("softplus", "raw")),
         ("eval_latent", ("mean", "sample")),
     ):
@@ -207,9 +236,9 @@ def _checked(config: AgentConfig) -> AgentConfig:
             f"observation {config.observation!r} does not go with encoder {config.encoder!r};"
             " convolutions read 'pixels' or 'index', the mlp reads 'features' or 'index'"
         )
-    if config.encoder == "conv" and config.normalise_features:
+    if config.encoder == "conv" and config.normalize_features:
         raise ConfigError(
-            "normalise_features is for precomputed features; the conv encoder has none, leave it out"
+            "normalize_features is for precomputed features; the conv encoder has none, leave it out"
         )
     if config.pretrained and (config.encoder, config.observation) != ("mlp", "index"):
         raise ConfigError(

@@ -10,32 +10,35 @@ from torch.distributions import Categorical
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from vusfa.modules import (
+    ARCHITECTURES,
     MODELS,
-    PRESETS,
-    ActingPolicy,
     Agent,
-    action_chances,
-    action_logits,
+    InferencePolicy,
+    action_probs,
     draw,
     draw_actions,
-    frozen,
 )
-from vusfa.modules.rows import SceneBlocks, SceneRows
+from vusfa.modules.rows import SceneBlocks, SortedByScene
 
 MakeAgent = Callable[..., Agent]
 MakeBatch = Callable[..., TensorDict]
 
 
-@pytest.mark.parametrize("preset", PRESETS)
+@pytest.mark.parametrize("architecture", ARCHITECTURES)
 @pytest.mark.parametrize("model", MODELS)
 class TestBesideTheActor:
     @pytest.mark.parametrize("batch", [(), (3,), (2, 5), (60,)])
     def test_the_same_draws_of_the_same_logits(
-        self, small_agent: MakeAgent, make_batch: MakeBatch, model: str, preset: str, batch: tuple[int, ...]
+        self,
+        small_agent: MakeAgent,
+        make_batch: MakeBatch,
+        model: str,
+        architecture: str,
+        batch: tuple[int, ...],
     ) -> None:
-        agent, data = small_agent(model, preset), make_batch(*batch)
+        agent, data = small_agent(model, architecture), make_batch(*batch)
         actions = []
-        for policy in (agent.get_policy_operator(), ActingPolicy(agent)):
+        for policy in (agent.get_policy_operator(), InferencePolicy(agent)):
             torch.manual_seed(3)
             actions.append(policy(data.clone())["action"])
         assert actions[0].shape == batch
@@ -43,36 +46,36 @@ class TestBesideTheActor:
 
     @pytest.mark.parametrize("history", [1, 4])
     def test_logits(
-        self, small_agent: MakeAgent, make_batch: MakeBatch, model: str, preset: str, history: int
+        self, small_agent: MakeAgent, make_batch: MakeBatch, model: str, architecture: str, history: int
     ) -> None:
-        agent, data = small_agent(model, preset, history=history), make_batch(40)
+        agent, data = small_agent(model, architecture, history=history), make_batch(40)
         wanted = agent.get_policy_operator().get_dist_params(data.clone())["logits"]
-        rows = data["state_id"], data["goal_id"], data["scene_id"]
-        torch.testing.assert_close(action_logits(agent, *rows), wanted, atol=1e-5, rtol=1e-5)
-        blocks = SceneBlocks.of(*SceneRows.sort(data["scene_id"], 3))
+        policy, rows = InferencePolicy(agent), (data["state_id"], data["goal_id"], data["scene_id"])
+        torch.testing.assert_close(policy.logits(*rows), wanted, atol=1e-5, rtol=1e-5)
+        blocks = SceneBlocks.of(*SortedByScene.sort(data["scene_id"], 3))
         assert blocks is not None
-        torch.testing.assert_close(action_logits(agent, *rows[:2], blocks), wanted, atol=1e-5, rtol=1e-5)
-        with torch.no_grad(), frozen(agent):
-            torch.testing.assert_close(action_logits(agent, *rows), wanted, atol=1e-5, rtol=1e-5)
-            torch.testing.assert_close(action_logits(agent, *rows[:2], blocks), wanted, atol=1e-5, rtol=1e-5)
+        torch.testing.assert_close(policy.logits(*rows[:2], blocks), wanted, atol=1e-5, rtol=1e-5)
+        with policy.cached():
+            torch.testing.assert_close(policy.logits(*rows), wanted, atol=1e-5, rtol=1e-5)
+            torch.testing.assert_close(policy.logits(*rows[:2], blocks), wanted, atol=1e-5, rtol=1e-5)
 
 
 def test_it_writes_the_action_alone(small_agent: MakeAgent, make_batch: MakeBatch) -> None:
     data = make_batch(4, 3)
     before = set(data.keys())
-    assert set(ActingPolicy(small_agent("vusfa"))(data).keys()) - before == {"action"}
+    assert set(InferencePolicy(small_agent("vusfa"))(data).keys()) - before == {"action"}
 
 
 def test_the_likeliest_action_when_that_is_asked_for(small_agent: MakeAgent, make_batch: MakeBatch) -> None:
     agent, data = small_agent("vusfa"), make_batch(50)
     wanted = agent.get_policy_operator().get_dist_params(data.clone())["logits"].argmax(-1)
     with set_exploration_type(ExplorationType.DETERMINISTIC):
-        assert torch.equal(ActingPolicy(agent)(data)["action"], wanted)
+        assert torch.equal(InferencePolicy(agent)(data)["action"], wanted)
 
 
 def test_weights_are_the_agents_own(small_agent: MakeAgent, make_batch: MakeBatch) -> None:
     agent, data = small_agent("gvf"), make_batch(200)
-    policy = ActingPolicy(agent)
+    policy = InferencePolicy(agent)
     policy(data)
     with torch.no_grad():
         agent.policy.linear.bias.zero_()[:, 2] = 1e6
@@ -81,7 +84,7 @@ def test_weights_are_the_agents_own(small_agent: MakeAgent, make_batch: MakeBatc
 
 def test_an_agent_with_a_memory_is_refused(small_agent: MakeAgent) -> None:
     with pytest.raises(ValueError, match="get_policy_operator"):
-        ActingPolicy(small_agent("vusfa", memory="lstm"))
+        InferencePolicy(small_agent("vusfa", memory="lstm"))
 
 
 class TestDraws:
@@ -93,14 +96,14 @@ class TestDraws:
         assert torch.equal(draw_actions(logits), wanted)
 
     @pytest.mark.parametrize("rows", [1, 7, 500])
-    def test_chances_are_drawn_from_as_multinomial_does(self, rows: int) -> None:
-        chances = action_chances(torch.randn(rows, 4) * 3)
-        torch.testing.assert_close(chances, Categorical(probs=chances).probs)
+    def test_probs_are_drawn_from_as_multinomial_does(self, rows: int) -> None:
+        probs = action_probs(torch.randn(rows, 4) * 3)
+        torch.testing.assert_close(probs, Categorical(probs=probs).probs)
         for seed in range(20):
             torch.manual_seed(seed)
-            wanted, after = torch.multinomial(chances, 1).squeeze(-1), torch.get_rng_state()
+            wanted, after = torch.multinomial(probs, 1).squeeze(-1), torch.get_rng_state()
             torch.manual_seed(seed)
-            assert torch.equal(draw(chances), wanted)
+            assert torch.equal(draw(probs), wanted)
             assert torch.equal(torch.get_rng_state(), after)
 
     def test_by_hand(self) -> None:

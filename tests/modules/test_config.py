@@ -5,13 +5,13 @@ from typing import Any
 import pytest
 
 from vusfa.errors import ConfigError
-from vusfa.modules import MODELS, PRESETS, resolve_config
+from vusfa.modules import ARCHITECTURES, MODELS, resolve_config
 
 
 class TestTables:
     def test_each_model_adds_one_idea(self) -> None:
         """GVF, + psi . omega, + SFDP, + bottleneck."""
-        assert [sum(MODELS[model]) for model in ("gvf", "usfa", "sfdp", "vusfa")] == [0, 1, 2, 3]
+        assert [sum(MODELS[model][:3]) for model in ("gvf", "usfa", "sfdp", "vusfa")] == [0, 1, 2, 3]
 
     def test_controlled_models_differ_in_nothing_but_their_idea(self) -> None:
         """All fields agree, except those that only the bottleneck reads."""
@@ -37,8 +37,8 @@ class TestTables:
 
 class TestOverrides:
     def test_taken(self) -> None:
-        config = resolve_config("sfdp", history=2, successor_norm="rms", successor_gain=0.5)
-        assert (config.history, config.successor_norm, config.successor_gain) == (2, "rms", 0.5)
+        config = resolve_config("sfdp", history=2, successor_norm=None)
+        assert (config.history, config.successor_norm) == (2, None)
 
     def test_memory_needs_no_history(self) -> None:
         assert resolve_config("usfa", memory="lstm").history == 1
@@ -46,15 +46,15 @@ class TestOverrides:
         assert resolve_config("usfa", memory=None).history == 4
 
     def test_pixels_bring_convolutions(self) -> None:
-        assert not resolve_config("usfa", observation="pixels").normalise_features
+        assert not resolve_config("usfa", observation="pixels").normalize_features
         assert resolve_config("usfa", observation="pixels").encoder == "conv"
         assert resolve_config("usfa", encoder="conv", picture_size=[40, 50]).picture_size == (40, 50)
 
-    @pytest.mark.parametrize("preset", PRESETS)
+    @pytest.mark.parametrize("architecture", ARCHITECTURES)
     @pytest.mark.parametrize("model", MODELS)
-    def test_what_a_config_holds_builds_it_again(self, model: str, preset: str) -> None:
+    def test_what_a_config_holds_builds_it_again(self, model: str, architecture: str) -> None:
         """Checkpoints hold all fields; given back, none of them is refused."""
-        config = resolve_config(model, preset)
+        config = resolve_config(model, architecture)
         assert resolve_config(**vars(config)) == config
 
     @pytest.mark.parametrize(
@@ -62,7 +62,7 @@ class TestOverrides:
         [
             ({"model": "vufsa"}, "model is 'vufsa'; did you mean 'vusfa'"),
             ({"model": "dqn"}, "model is 'dqn'; it must be one of 'gvf', 'usfa', 'sfdp', 'vusfa'"),
-            ({"preset": "control"}, "preset is 'control'; did you mean 'controlled'"),
+            ({"architecture": "control"}, "architecture is 'control'; did you mean 'controlled'"),
             ({"embeding_size": 3}, "no field 'embeding_size'; did you mean 'embedding_size'"),
             ({"beta": 3}, "no field 'beta'; it must be one of 'history', "),
             ({"history": 0}, "history is 0; it must be a whole number"),
@@ -72,12 +72,21 @@ class TestOverrides:
             ({"observation": "feature"}, "observation is 'feature'; did you mean 'features'"),
             ({"observation": "features", "encoder": "conv"}, "'features' does not go with encoder 'conv'"),
             ({"observation": "pixels", "encoder": "mlp"}, "'pixels' does not go with encoder 'mlp'"),
-            ({"encoder": "conv", "normalise_features": True}, "normalise_features is for precomputed"),
+            ({"encoder": "conv", "normalize_features": True}, "normalize_features is for precomputed"),
             ({"embedding_layer": False}, "embedding_layer is False, but the bottleneck"),
             ({"model": "gvf", "embedding_layer": False, "embedding_size": 8}, "they must be equal"),
-            ({"preset": "paper", "successor_norm": "rms"}, "successor_norm is no part of preset 'paper'"),
-            ({"preset": "reference", "normalise_features": True}, "no part of preset 'reference'"),
-            ({"preset": "reference", "reward_scale": 0.5}, "reward_scale is no part of preset 'reference'"),
+            (
+                {"architecture": "paper", "successor_norm": "layer"},
+                "successor_norm is no part of",
+            ),
+            (
+                {"architecture": "reference", "normalize_features": True},
+                "no part of architecture 'ref",
+            ),
+            (
+                {"architecture": "reference", "reward_scale": 0.5},
+                "reward_scale is no part of",
+            ),
             ({"picture_size": 60}, "picture_size is 60"),
             ({"picture_size": [60]}, r"picture_size is \[60\]"),
         ],

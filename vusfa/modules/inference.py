@@ -1,0 +1,271 @@
+"""Inference-only policies: the actor's actions, without the tensors that only a loss reads.
+
+An actor made of TensorDictModules writes everything that a loss may read. Collecting and evaluating read
+actions alone, at every step, of few rows; then moving tensors about costs as much as the matrix products do.
+:class:`InferencePolicy` runs the actor's own layers on plain tensors. While weights stand still
+(:meth:`InferencePolicy.cached`), whatever depends on single frames is computed once, and an agent that sees
+one frame by its id becomes a table (:class:`TabularPolicy`). This is the one place where something is kept
+from call to call.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from tensordict.nn.probabilistic import InteractionType, interaction_type
+from torch import Tensor, nn
+
+from vusfa.deprecated import moved_names
+from vusfa.modules.draws import action_probs, draw, draw_actions
+from vusfa.modules.precision import autocast_copy
+from vusfa.modules.rows import RowScenes, SceneBlocks, SortedByScene
+from vusfa.modules.trunk import CachedTrunk, SiameseTrunk
+from vusfa.scenes import SceneSet
+
+if TYPE_CHECKING:
+    from vusfa.modules.agents import Agent
+
+__all__ = ["InferencePolicy", "TabularPolicy"]
+
+#: A table is made where it has at most this many pairs of state and goal per row that will be asked for.
+PAIRS_PER_ROW = 3
+
+
+class _Layers(NamedTuple):
+    """The actor's layers as they are run: ``trunk`` on states and goals, ``heads`` on what it returns."""
+
+    trunk: Callable[[Tensor, Tensor], Any]
+    heads: list[nn.Module]
+
+
+class InferencePolicy(TensorDictModuleBase):
+    """Inference-only policy: the same actions as the actor's, without intermediate tensors.
+
+    It writes ``action`` and nothing else. Actions are drawn by default;
+    ``torchrl.envs.utils.set_exploration_type`` asks for the likeliest. Weights are the agent's own, so an
+    update reaches it at once.
+
+    Args:
+        agent: any without a memory, whose state would have to be written, too.
+
+    Raises:
+        ValueError: for an agent with a memory; its actor is ``agent.get_policy_operator()``.
+
+    >>> from tensordict import TensorDict
+    >>> from vusfa.modules import make_agent
+    >>> from vusfa.scenes import SceneSet
+    >>> policy = InferencePolicy(make_agent("vusfa", scenes=SceneSet.bundled()))
+    >>> rows = TensorDict({"state_id": torch.zeros(3, 4).long(), "goal_id": torch.arange(3)}, [3])
+    >>> policy(rows.set("scene_id", torch.zeros(3).long()))["action"].shape
+    torch.Size([3])
+    >>> with policy.cached(goals=torch.arange(3)):
+    ...     policy(rows)["action"].shape
+    torch.Size([3])
+    """
+
+    def __init__(self, agent: Agent) -> None:
+        super().__init__()
+        if agent.memory is not None:
+            raise ValueError("the agent has a memory, which must be kept; take agent.get_policy_operator()")
+        self.agent = agent
+        trunk, *heads = agent.actor_steps()
+        self.in_keys = [*trunk.in_keys, "scene_id"]
+        self.out_keys = ["action"]
+        read = {key for step in heads for key in step.in_keys}
+        self._whole = not isinstance(trunk.module, SiameseTrunk) or bool(read & set(trunk.out_keys[:-1]))
+        self._trunk_keys = trunk.out_keys if self._whole else trunk.out_keys[-1:]
+        self._keys = [(step.in_keys, step.out_keys) for step in heads]
+        self._layers: _Layers | None = None
+        self._table: list[TabularPolicy] = []
+
+    @contextmanager
+    def cached(
+        self, goals: Tensor | None = None, scenes: SceneSet | None = None, rows: int | None = None
+    ) -> Iterator[None]:
+        """Within it, answers are of the weights on entry, and what they share is computed once.
+
+        The weights must not change meanwhile, and calls are without gradients.
+
+        Args:
+            goals: (G,) ids of the only states that will be goals; None for all of the world.
+            scenes: the agent's world, for an agent that sees one frame: all its answers are then tabulated,
+                where these are at most three times as many as ``rows``.
+            rows: rows that will be asked for; None for many.
+        """
+        before = self._layers, self._table
+        try:
+            if scenes is not None and self.agent.is_tabular and _table_pays(scenes, goals, rows):
+                self._table = [TabularPolicy(self.agent, scenes, goals)]
+            else:
+                self._layers = self._cached_layers(goals)
+            yield
+        finally:
+            self._layers, self._table = before
+
+    def _cached_layers(self, goals: Tensor | None) -> _Layers:
+        trunk, *heads = (step.module for step in self.agent.actor_steps())
+        if self._whole or not trunk.encoder.by_id:
+            trunk, *heads = autocast_copy([trunk, *heads])
+            return _Layers(trunk if self._whole else trunk.fused, heads)
+        return _Layers(CachedTrunk(trunk, goals).fused, autocast_copy(heads))
+
+    def logits(self, state: Tensor, goal: Tensor, scene_id: RowScenes) -> Tensor:
+        """Logits (R, A) float32 of rows.
+
+        Args:
+            state: (R, H) int64 ids, oldest first, or observations (R, H, ...), as the agent reads them.
+            goal: (R,) ids, or observations (R, ...).
+            scene_id: (R,) int64; or, of rows sorted by scene, with the counts; or blocks that the rows, in
+                any order, are to be laid out in.
+        """
+        trunk, heads = self._layers or self._own_layers()
+        written = trunk(state, goal)
+        values: dict[Any, Any] = dict(zip(self._trunk_keys, _tuple(written), strict=True))
+        blocks = scene_id if isinstance(scene_id, SceneBlocks) else None
+        if blocks is not None:
+            values = {key: blocks.lay_out(value) for key, value in values.items()}
+        values["scene_id"] = scene_id
+        for head, (in_keys, out_keys) in zip(heads, self._keys, strict=True):
+            values.update(zip(out_keys, _tuple(head(*(values[key] for key in in_keys))), strict=True))
+        return values["logits"] if blocks is None else blocks.pick_up(values["logits"])
+
+    def _own_layers(self) -> _Layers:
+        trunk, *heads = (step.module for step in self.agent.actor_steps())
+        return _Layers(trunk if self._whole else trunk.fused, heads)
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Adds ``action``, (\\*B,) int64."""
+        if self._table:
+            return self._table[0](tensordict)
+        state, goal, scene = (tensordict.get(key) for key in self.in_keys)
+        batch = scene.dim()
+        rows = state.reshape(-1, *state.shape[batch:]), goal.reshape(-1, *goal.shape[batch:])
+        actions = draw_actions(self._by_scene(*rows, scene.reshape(-1)), interaction_type())
+        return tensordict.set("action", actions.view(scene.shape))
+
+    def _by_scene(self, state: Tensor, goal: Tensor, scene: Tensor) -> Tensor:
+        """Logits of rows in any order, computed scene by scene."""
+        if self.agent.num_scenes == 1 or scene.is_cuda:  # there counting means waiting for the device
+            return self.logits(state, goal, scene)
+        rows, order = SortedByScene.sort(scene, self.agent.num_scenes)
+        blocks = SceneBlocks.of(rows, order)
+        if blocks is not None:
+            return self.logits(state, goal, blocks)
+        logits = self.logits(state[order], goal[order], rows)
+        return torch.empty_like(logits).index_copy_(0, order, logits)
+
+
+class TabularPolicy(TensorDictModuleBase):
+    """The policy of an agent that sees one frame by its id, as a table: logits of every state to every goal
+    in its scene.
+
+    Such an agent is a function of two small numbers. Where many steps are walked with the same weights, one
+    large product for all pairs and a look-up per step cost less than asking it at every step. Pairs are
+    numbered scene by scene, goal by goal, state by state. Actions are those of
+    :func:`~vusfa.modules.draws.draw_actions` from the pair's logits.
+
+    Args:
+        agent: as it is now; later updates do not reach the table.
+        scenes: its world.
+        goals: (G,) global ids of the only goals that will be asked for; None for all states.
+        at_once: pairs that are computed together.
+
+    Attributes:
+        state, goal, scene: (P,) int64, of each pair: global ids, and the scene's index.
+
+    Raises:
+        ValueError: for an agent that sees more than one frame, or something else than ids.
+
+    >>> from tensordict import TensorDict
+    >>> from vusfa.modules import make_agent
+    >>> rooms = SceneSet.bundled(["bathroom"])
+    >>> policy = TabularPolicy(make_agent("gvf", scenes=rooms, history=1, hidden_size=8), rooms)
+    >>> rows = TensorDict({"state_id": torch.zeros(3, 1).long(), "goal_id": torch.arange(3)}, [3])
+    >>> policy(rows)["action"].shape, policy.logits(torch.tensor([5]), torch.tensor([7])).shape
+    (torch.Size([3]), torch.Size([1, 4]))
+    """
+
+    def __init__(
+        self, agent: Agent, scenes: SceneSet, goals: Tensor | None = None, *, at_once: int = 50_000
+    ) -> None:
+        if not agent.is_tabular:
+            config = agent.config
+            raise ValueError(
+                "only the policy of an agent that sees one frame, by its id, without a memory, is a table;"
+                f" this one has history={config['history']}, observation={config['observation']},"
+                f" memory={config['memory']}"
+            )
+        super().__init__()
+        self.in_keys, self.out_keys = ["state_id", "goal_id"], ["action"]
+        every = torch.arange(scenes.num_states, device=scenes.device)
+        goals = every if goals is None else goals.to(scenes.device).unique()  # sorted, hence scene by scene
+        scene = scenes.scene_id[goals]
+        size, offset = scenes.offsets.diff()[scene], scenes.offsets[scene]
+        first = size.cumsum(0) - size
+        # so that base[goal] + state is the pair's number; where a state is no goal, far below every number
+        self._base = torch.full_like(every, -(2**40)).index_copy_(0, goals, first - offset)
+        which = torch.repeat_interleave(torch.arange(len(goals), device=goals.device), size)
+        self.goal, self.scene = goals[which], scene[which]
+        self.state = torch.arange(len(which), device=goals.device) - (first - offset)[which]
+        self._logits = self._ask(agent, goals, at_once)
+        self._probs: Tensor | None = None
+
+    @torch.no_grad()
+    def _ask(self, agent: Agent, goals: Tensor, at_once: int) -> Tensor:
+        policy, parts = InferencePolicy(agent), []
+        columns = (part.split(at_once) for part in (self.state, self.goal, self.scene))
+        with policy.cached(goals):
+            for state, goal, scene in zip(*columns, strict=True):
+                rows: RowScenes = scene
+                if agent.num_scenes > 1 and not scene.is_cuda:  # there counting means waiting for the device
+                    rows = SortedByScene.of(scene, agent.num_scenes)
+                parts.append(policy.logits(state.unsqueeze(-1), goal, rows))
+        return torch.cat(parts)
+
+    def rows(self, state: Tensor, goal: Tensor) -> Tensor:
+        """Numbers (\\*B,) of pairs of global ids (\\*B,); negative where the goal is not among the goals."""
+        return self._base[goal] + state
+
+    def logits(self, state: Tensor, goal: Tensor) -> Tensor:
+        """Logits (\\*B, A) for global ids of states and of goals in the same scene, (\\*B,)."""
+        return self._logits[self.rows(state, goal)]
+
+    def probabilities(self, state: Tensor, goal: Tensor, scene: Tensor) -> Tensor:
+        """Probabilities (\\*B, A) of the actions, for :func:`vusfa.evaluation.exact.exact_goals`."""
+        return self.logits(state, goal).softmax(-1)
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Adds ``action``, (\\*B,) int64."""
+        rows = self.rows(tensordict.get("state_id")[..., -1], tensordict.get("goal_id"))
+        interaction = interaction_type()
+        if interaction in (None, InteractionType.RANDOM):
+            if self._probs is None:
+                self._probs = action_probs(self._logits)
+            return tensordict.set("action", draw(self._probs[rows]))
+        return tensordict.set("action", draw_actions(self._logits[rows], interaction))
+
+
+def _table_pays(scenes: SceneSet, goals: Tensor | None, rows: int | None) -> bool:
+    """A pair in a product of thousands costs a fraction of what it costs in a step's product of 64 rows."""
+    if rows is None:
+        return True
+    scene = scenes.scene_id if goals is None else scenes.scene_id[goals.to(scenes.device).unique()]
+    return int(scenes.offsets.diff()[scene].sum()) <= PAIRS_PER_ROW * rows
+
+
+def _tuple(written: Any) -> tuple[Any, ...]:
+    return written if isinstance(written, tuple) else (written,)
+
+
+__getattr__ = moved_names(
+    __name__,
+    {
+        "ActingPolicy": "vusfa.modules.InferencePolicy",
+        "TabulatedPolicy": "vusfa.modules.TabularPolicy",
+    },
+)

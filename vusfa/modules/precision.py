@@ -1,0 +1,89 @@
+"""Numeric precision: what autocast converts, and row counts that bfloat16 kernels have met before.
+
+A processor compiles a bfloat16 kernel per matrix shape, which takes longer than running it and stays in
+memory. Where the number of rows changes from call to call, rows of zeros bring it to one of a few bucket
+sizes (:func:`bucket_size`).
+"""
+
+from __future__ import annotations
+
+import copy
+from typing import TypeVar
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+__all__ = ["autocast_copy", "bucket_size", "for_autocast", "is_bucketed", "padded_linear"]
+
+_Modules = TypeVar("_Modules")
+
+
+def for_autocast(tensor: Tensor) -> Tensor:
+    """A tensor as autocast would convert it for a matrix product, where autocast is on; else unchanged.
+
+    >>> with torch.autocast("cpu", torch.bfloat16):
+    ...     for_autocast(torch.zeros(2)).dtype
+    torch.bfloat16
+    """
+    device = tensor.device.type
+    return tensor.to(torch.get_autocast_dtype(device)) if torch.is_autocast_enabled(device) else tensor
+
+
+def autocast_copy(modules: _Modules) -> _Modules:
+    """A copy of modules for inference, its weights converted once as autocast would at each call.
+
+    Buffers, and weights that need no conversion, are shared with the originals.
+
+    Args:
+        modules: a module, or a list of modules, which may share submodules.
+
+    >>> layer = nn.Linear(2, 3)
+    >>> with torch.autocast("cpu", torch.bfloat16):
+    ...     autocast_copy(layer).weight.dtype, autocast_copy([layer])[0].bias.dtype
+    (torch.bfloat16, torch.bfloat16)
+    """
+    memo: dict[int, Tensor] = {}
+    for module in modules if isinstance(modules, list | tuple) else [modules]:
+        for weight in module.parameters():
+            memo[id(weight)] = nn.Parameter(for_autocast(weight.detach()), requires_grad=False)
+        memo.update((id(buffer), buffer) for buffer in module.buffers())
+    return copy.deepcopy(modules, memo)
+
+
+def bucket_size(number: int) -> int:
+    """The next larger of a few numbers: 16, 32, ... 256, 288, ..., 512, 576, ..., eight per octave.
+
+    >>> [bucket_size(number) for number in (1, 17, 256, 257, 1025)]
+    [16, 32, 256, 288, 1152]
+    """
+    step = max(16, 1 << max(0, number.bit_length() - 4))
+    return number + -number % step
+
+
+def is_bucketed(rows: Tensor) -> bool:
+    """Whether the number of rows (R, ...) should be a bucket size: in bfloat16 on a processor."""
+    return not rows.is_cuda and for_autocast(rows).dtype == torch.bfloat16
+
+
+def padded_linear(rows: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
+    """``torch.nn.functional.linear`` for a number of rows that changes from call to call.
+
+    Rows of zeros are added where :func:`is_bucketed`; they add nothing to outputs or gradients.
+
+    Args:
+        rows: (R, in); with more dimensions, never padded.
+        weight: (out, in).
+        bias: (out,).
+
+    Returns:
+        (R, out).
+
+    >>> padded_linear(torch.ones(3, 2), torch.ones(1, 2), torch.ones(1)).flatten()
+    tensor([3., 3., 3.])
+    """
+    number = len(rows) if rows.dim() == 2 and is_bucketed(rows) else 0
+    missing = bucket_size(number) - number
+    if not missing:
+        return functional.linear(rows, weight, bias)
+    return functional.linear(functional.pad(rows, (0, 0, 0, missing)), weight, bias)[:number]

@@ -1,0 +1,85 @@
+"""Compute each distinct row once: unique rows -> run -> gather.
+
+A batch of thousands of steps visits a few hundred states on the way to a few goals. The encoder therefore
+runs on the DISTINCT states and goals of a batch, and the loss on its distinct pairs of both
+(:class:`vusfa.objectives.USFLoss`): :func:`unique_rows` finds them, the network runs on them, and
+:func:`gather` looks up each row's result. Gradients of equal rows add up before they go through the network.
+
+>>> unique = unique_rows(torch.tensor([4, 7, 4, 4]), torch.tensor([1, 1, 1, 0]))
+>>> [column.tolist() for column in unique.columns], unique.index.tolist()
+([[4, 4, 7], [0, 1, 1]], [1, 2, 1, 0])
+>>> state, goal = unique.columns
+>>> gather((10 * state + goal).unsqueeze(-1), unique.index).flatten().tolist()
+[41, 71, 41, 40]
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from vusfa.modules.precision import bucket_size
+
+__all__ = ["Rows", "Unique", "gather", "unique_rows"]
+
+
+class Unique(NamedTuple):
+    """Distinct rows of integer columns.
+
+    Attributes:
+        columns: (D,) int64 per column, the distinct rows in ascending order, the last column first.
+        index: (\\*B,) int64, the distinct row of each row.
+    """
+
+    columns: tuple[Tensor, ...]
+    index: Tensor
+
+    def padded(self) -> Unique:
+        """The same with rows of zeros at the end, which no index names, so that D is a bucket size.
+
+        >>> len(unique_rows(torch.tensor([5, 5, 3])).padded().columns[0])
+        16
+        """
+        missing = bucket_size(len(self.columns[0])) - len(self.columns[0])
+        return Unique(tuple(functional.pad(column, (0, missing)) for column in self.columns), self.index)
+
+
+class Rows(NamedTuple):
+    """What was computed for some rows, to be gathered for all.
+
+    Attributes:
+        values: (D, F) per distinct row; or, without an index, (R, F) for the rows themselves.
+        index: (R,) int64, or None.
+    """
+
+    values: Tensor
+    index: Tensor | None = None
+
+
+def unique_rows(*columns: Tensor) -> Unique:
+    """The distinct rows of one or more columns (\\*B,) of integers that are not negative."""
+    first, *others = (column.reshape(-1).long() for column in columns)
+    if not others:
+        distinct, index = torch.unique(first, return_inverse=True)
+        return Unique((distinct,), index.view(columns[0].shape))
+    key = torch.zeros_like(first)
+    for column in reversed([first, *others]):
+        key = key * (column.max() + 1) + column
+    distinct, index = torch.unique(key, return_inverse=True)
+    one = torch.empty_like(distinct).scatter_(0, index, torch.arange(len(index), device=index.device))
+    found = tuple(column[one] for column in (first, *others))
+    return Unique(found, index.view(columns[0].shape))
+
+
+def gather(values: Tensor, index: Tensor | None) -> Tensor:
+    """Values (D, ...) of distinct rows, row by row: (\\*B, ...) for an index (\\*B,); as they are for None.
+
+    >>> gather(torch.tensor([[1.0], [5.0]]), torch.tensor([1, 1, 0])).flatten().tolist()
+    [5.0, 5.0, 1.0]
+    """
+    if index is None:
+        return values
+    return functional.embedding(index, values) if values.dim() == 2 else values[index]
