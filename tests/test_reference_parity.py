@@ -109,8 +109,8 @@ class TestEnvironment:
         assert set(seen) <= set(traces["reset"]["states_seen_when_rows_blocked"])
 
 
-# Layer names of the golden files, in our agents. `encoder` is the siamese encoder, which the bottleneck of M4
-# wraps; policy heads of one and of two layers are told apart below.
+# Layer names of the golden files, in our agents. Policy heads of one and of two layers are told apart
+# below.
 LAYERS = {
     "fc1": "encoder.branch.first",
     "fc1_s1": "encoder.branch.last",
@@ -147,13 +147,10 @@ class Released(NamedTuple):
 
 def parameter(agent: Agent, variable: dict[str, Any]) -> torch.nn.Parameter:
     """Our parameter that holds a golden variable (of all scenes, where each scene has its own)."""
-    module = agent.encoder.encoder if agent.config["model"] == "vusfa" else agent.encoder
-    path = LAYERS[variable["layer"]].removeprefix("encoder.")
-    if path == LAYERS[variable["layer"]]:
-        module = agent
+    path = LAYERS[variable["layer"]]
     if path == "policy.last" and not hasattr(agent.policy, "last"):
         path = "policy.linear"
-    return module.get_parameter(f"{path}.{'weight' if variable['kind'] == 'W' else 'bias'}")
+    return agent.get_parameter(f"{path}.{'weight' if variable['kind'] == 'W' else 'bias'}")
 
 
 def as_golden(tensor: Tensor, variable: dict[str, Any]) -> Tensor:

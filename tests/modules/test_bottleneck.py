@@ -24,7 +24,7 @@ class TestGaussianBottleneck:
         state, goal, state_loc, state_scale, state_kl, goal_loc, goal_scale, goal_kl = module(*inputs)
         states, goals = module.first_layer(*inputs)
         state_code = module.branch.finish(states.values)
-        goal_code = module.branch.finish(goals.values)[goals.index]
+        goal_code = module.branch.finish(goals.values)[goals.inverse]
         assert torch.equal(state, state_loc)
         assert torch.equal(goal, goal_loc)
         for kl, loc, scale in ((state_kl, state_loc, state_scale), (goal_kl, goal_loc, goal_scale)):

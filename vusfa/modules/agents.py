@@ -150,7 +150,7 @@ class Agent(nn.Module):
         self.config = _plain(config, scenes)
         self.num_scenes: int = 1 if config.shared_heads else scenes.num_scenes
         hidden = config.hidden_size
-        self.encoder: nn.Module = self.make_encoder(config, scenes)
+        self.encoder = self.make_encoder(config, scenes)
         self.encoder.requires_grad_(config.pretrained is None)
         self.fusion = Fusion(config.embedding_size, hidden)
         self.scene_layer = SceneLayer(self.num_scenes, hidden, hidden)
@@ -171,7 +171,7 @@ class Agent(nn.Module):
         config = self.config
         return config["history"] == 1 and config["observation"] == "index" and config["memory"] is None
 
-    def make_encoder(self, config: AgentConfig, scenes: Any) -> nn.Module:
+    def make_encoder(self, config: AgentConfig, scenes: Any) -> SiameseEncoder:
         """phi; reads states and goals, see :class:`~vusfa.modules.siamese.SiameseEncoder`."""
         by_id = config.observation == "index"
         frames: FeatureFrames | PictureFrames

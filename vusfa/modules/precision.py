@@ -8,15 +8,14 @@ sizes (:func:`bucket_size`).
 from __future__ import annotations
 
 import copy
-from typing import TypeVar
+from collections.abc import Sequence
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
 __all__ = ["autocast_copy", "bucket_size", "for_autocast", "is_bucketed", "padded_linear"]
-
-_Modules = TypeVar("_Modules")
 
 
 def for_autocast(tensor: Tensor) -> Tensor:
@@ -30,25 +29,25 @@ def for_autocast(tensor: Tensor) -> Tensor:
     return tensor.to(torch.get_autocast_dtype(device)) if torch.is_autocast_enabled(device) else tensor
 
 
-def autocast_copy(modules: _Modules) -> _Modules:
+def autocast_copy(modules: Sequence[Any]) -> list[Any]:
     """A copy of modules for inference, its weights converted once as autocast would at each call.
 
     Buffers, and weights that need no conversion, are shared with the originals.
 
     Args:
-        modules: a module, or a list of modules, which may share submodules.
+        modules: they may share submodules.
 
     >>> layer = nn.Linear(2, 3)
     >>> with torch.autocast("cpu", torch.bfloat16):
-    ...     autocast_copy(layer).weight.dtype, autocast_copy([layer])[0].bias.dtype
-    (torch.bfloat16, torch.bfloat16)
+    ...     autocast_copy([layer])[0].bias.dtype
+    torch.bfloat16
     """
     memo: dict[int, Tensor] = {}
-    for module in modules if isinstance(modules, list | tuple) else [modules]:
+    for module in modules:
         for weight in module.parameters():
             memo[id(weight)] = nn.Parameter(for_autocast(weight.detach()), requires_grad=False)
         memo.update((id(buffer), buffer) for buffer in module.buffers())
-    return copy.deepcopy(modules, memo)
+    return copy.deepcopy(list(modules), memo)
 
 
 def bucket_size(number: int) -> int:

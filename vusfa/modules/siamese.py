@@ -44,7 +44,7 @@ class Encoding(NamedTuple):
     def gather(self, index: Tensor | None, batch: torch.Size) -> Encoding:
         """The encodings of rows: each (\\*batch, ...); one look-up per tensor, even if it stands twice."""
         parts = {id(part): gather(part, index).view(*batch, -1) for part in self if part is not None}
-        return Encoding(*(part if part is None else parts[id(part)] for part in self))
+        return Encoding(parts[id(self.embedding)], *(parts.get(id(part)) for part in self[1:]))
 
 
 class Branch(nn.Module):
@@ -153,8 +153,8 @@ class SiameseEncoder(nn.Module):
         """
         states, goals = self.first_layer(state, goal)
         batch = self.batch_shape(state)
-        of_state = self.encode_state(states.values).gather(states.index, batch)
-        of_goal = self.encode_goal(goals.values).gather(goals.index, batch)
+        of_state = self.encode_state(states.values).gather(states.inverse, batch)
+        of_goal = self.encode_goal(goals.values).gather(goals.inverse, batch)
         return joined(of_state, of_goal)
 
     def batch_shape(self, state: Tensor) -> torch.Size:

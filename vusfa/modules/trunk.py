@@ -73,16 +73,16 @@ class SiameseTrunk(nn.Module):
         encoder, fusion, batch = self.encoder, self.fusion, self.encoder.batch_shape(state)
         states, goals = encoder.first_layer(state, goal)
         of_state, of_goal = encoder.encode_state(states.values), encoder.encode_goal(goals.values)
-        state_part = gather(fusion.state_part(of_state.embedding), states.index)
-        goal_part = gather(fusion.goal_part(of_goal.embedding), goals.index)
+        state_part = gather(fusion.state_part(of_state.embedding), states.inverse)
+        goal_part = gather(fusion.goal_part(of_goal.embedding), goals.inverse)
         fused = functional.relu(state_part + goal_part).view(*batch, -1)
-        return *joined(of_state.gather(states.index, batch), of_goal.gather(goals.index, batch)), fused
+        return *joined(of_state.gather(states.inverse, batch), of_goal.gather(goals.inverse, batch)), fused
 
     def fused(self, state: Tensor, goal: Tensor) -> Tensor:
         """The fused (\\*B, hidden) alone: no scale is computed and no embedding looked up."""
         states, goals = self.encoder.first_layer(state, goal)
-        state_part = gather(self.fusion.state_part(self.encoder.embed_state(states.values)), states.index)
-        goal_part = gather(self.fusion.goal_part(self.encoder.embed_goal(goals.values)), goals.index)
+        state_part = gather(self.fusion.state_part(self.encoder.embed_state(states.values)), states.inverse)
+        goal_part = gather(self.fusion.goal_part(self.encoder.embed_goal(goals.values)), goals.inverse)
         return functional.relu(state_part + goal_part).view(*self.encoder.batch_shape(state), -1)
 
 
@@ -105,7 +105,7 @@ class CachedTrunk:
     def __init__(self, trunk: SiameseTrunk, goals: Tensor | None = None) -> None:
         encoder, fusion = trunk.encoder, trunk.fusion
         features, first = encoder.frames.lookup(None), encoder.branch.first
-        self.trunk = autocast_copy(trunk)
+        (self.trunk,) = autocast_copy([trunk])
         if encoder.history == 1:  # (S, hidden), per state
             self.frames = fusion.state_part(encoder.embed_state(first(features.unsqueeze(-2))))
         else:  # (S, H, hidden), per frame and place

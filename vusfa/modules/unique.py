@@ -6,10 +6,10 @@ runs on the DISTINCT states and goals of a batch, and the loss on its distinct p
 :func:`gather` looks up each row's result. Gradients of equal rows add up before they go through the network.
 
 >>> unique = unique_rows(torch.tensor([4, 7, 4, 4]), torch.tensor([1, 1, 1, 0]))
->>> [column.tolist() for column in unique.columns], unique.index.tolist()
+>>> [column.tolist() for column in unique.columns], unique.inverse.tolist()
 ([[4, 4, 7], [0, 1, 1]], [1, 2, 1, 0])
 >>> state, goal = unique.columns
->>> gather((10 * state + goal).unsqueeze(-1), unique.index).flatten().tolist()
+>>> gather((10 * state + goal).unsqueeze(-1), unique.inverse).flatten().tolist()
 [41, 71, 41, 40]
 """
 
@@ -31,32 +31,32 @@ class Unique(NamedTuple):
 
     Attributes:
         columns: (D,) int64 per column, the distinct rows in ascending order, the last column first.
-        index: (\\*B,) int64, the distinct row of each row.
+        inverse: (\\*B,) int64, the distinct row of each row.
     """
 
     columns: tuple[Tensor, ...]
-    index: Tensor
+    inverse: Tensor
 
     def padded(self) -> Unique:
-        """The same with rows of zeros at the end, which no index names, so that D is a bucket size.
+        """The same with rows of zeros at the end, which no row belongs to, so that D is a bucket size.
 
         >>> len(unique_rows(torch.tensor([5, 5, 3])).padded().columns[0])
         16
         """
         missing = bucket_size(len(self.columns[0])) - len(self.columns[0])
-        return Unique(tuple(functional.pad(column, (0, missing)) for column in self.columns), self.index)
+        return Unique(tuple(functional.pad(column, (0, missing)) for column in self.columns), self.inverse)
 
 
 class Rows(NamedTuple):
     """What was computed for some rows, to be gathered for all.
 
     Attributes:
-        values: (D, F) per distinct row; or, without an index, (R, F) for the rows themselves.
-        index: (R,) int64, or None.
+        values: (D, F) per distinct row; or, without an inverse, (R, F) for the rows themselves.
+        inverse: (R,) int64, or None.
     """
 
     values: Tensor
-    index: Tensor | None = None
+    inverse: Tensor | None = None
 
 
 def unique_rows(*columns: Tensor) -> Unique:

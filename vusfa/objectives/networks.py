@@ -141,7 +141,7 @@ def unique_inputs(inputs: TensorDictBase) -> tuple[TensorDictBase, Tensor] | Non
         key: ids.to(column.dtype).view(distinct, *shape)
         for (key, column), ids, shape in zip(columns.items(), unique.columns, shapes, strict=True)
     }
-    return TensorDict(rows, [distinct]), unique.index
+    return TensorDict(rows, [distinct]), unique.inverse
 
 
 def select_inputs(tensordict: TensorDictBase, *keys: NestedKey) -> TensorDictBase:
@@ -205,7 +205,7 @@ def _is_probabilistic(module: nn.Module) -> bool:
 
 def _modules(sequence: TensorDictSequential) -> list[TensorDictModuleBase]:
     modules = sequence.module
-    return list(modules.values() if isinstance(modules, nn.ModuleDict) else modules)  # type: ignore[arg-type]
+    return list(modules.values() if isinstance(modules, nn.ModuleDict) else modules)
 
 
 def _actor_modules(actor: nn.Module) -> list[TensorDictModuleBase]:
