@@ -11,8 +11,8 @@ import pytest
 import torch
 from omegaconf import OmegaConf
 
-from vusfa.cli.launch import compose
 import vusfa.modules.inference
+from vusfa.cli.launch import compose
 from vusfa.conf import FOLDER as CONF
 from vusfa.errors import ConfigError, VusfaError
 from vusfa.modules import TabularPolicy
