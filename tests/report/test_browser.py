@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import dataclasses
 import itertools
 import json
 import re
@@ -257,4 +258,31 @@ def test_an_agent_with_a_past(
     assert tab.evaluate("at.way") == way
     assert tab.locator("#map-grid .map-row").count() == 2
     assert complaints == []
+    tab.close()
+
+
+HOSTILE = '"><img src=x onerror="window.hacked=1"><b>%{x}</b>'
+
+
+def test_names_are_text_never_markup(chromium: Any, runs: list[LoggedRun], tmp_path: Path):
+    """A model's name may hold anything; what a page's rule did not list by its hash would not run, either."""
+    hostile = [dataclasses.replace(run, label=HOSTILE) for run in runs[:2]]
+    write_report(hostile, tmp_path / "page.html", Options(goals_per_scene=2, walks=1, max_steps=9))
+    complaints: list[str] = []
+    tab = chromium.new_page()
+    tab.on("console", lambda message: complaints.append(message.text))
+    tab.on("pageerror", lambda error: complaints.append(str(error)))
+    tab.goto((tmp_path / "page.html").as_uri())
+    tab.wait_for_selector("html[data-ready=yes]")
+    assert tab.inner_text("#summary tbody tr:first-child td:first-child") == HOSTILE
+    label = tab.get_attribute("#map-grid svg", "aria-label")
+    assert label is not None
+    assert label.startswith(HOSTILE)
+    assert tab.locator("#map-grid img, #overview img, #curves img").count() == 0
+    assert tab.evaluate("window.hacked") is None
+    tab.evaluate(
+        "document.body.append(Object.assign(document.createElement('script'), {text: 'hacked = 2'}))"
+    )
+    assert tab.evaluate("window.hacked") is None
+    assert all("Content Security Policy" in line for line in complaints)
     tab.close()

@@ -9,7 +9,7 @@ from vusfa.evaluation.long_table import MEAN_OF_STATES, SUBSETS
 from vusfa.experiments.experiment import read_experiment
 from vusfa.experiments.markdown import flat_rows, markdown
 from vusfa.experiments.tables import (
-    COLUMNS,
+    columns,
     comparison_rows,
     distance_rows,
     middle_rows,
@@ -50,7 +50,7 @@ def print_tables(
     set_threads(threads)
     folder = check_folder(out or results / "tables", "out")
     experiment = read_experiment(results, experiments, SceneSet.open(scenes) if scenes else None)
-    names = ["model", "seeds", "num_goals", *COLUMNS]
+    names = ["model", "seeds", "num_goals", *columns()]
 
     runs = run_rows(experiment)
     show(
@@ -82,8 +82,10 @@ def print_tables(
     drawn = [[row for row in rows if row["mode"] == "sampled"] for rows in (far, middle, compared)]
     show("By actions from the nearest trained goal, actions drawn", drawn[0], ["distance", *names])
     show("Interquartile mean over seeds and scenes, actions drawn", drawn[1], ["goals", *names])
-    columns = ["goals", "measure", "model", "against", "seeds", "difference", "improvement"]
-    show("Paired differences and chances of improvement, both in %, actions drawn", drawn[2], columns)
+    compared_columns = ["goals", "measure", "model", "against", "seeds", "difference", "improvement"]
+    show(
+        "Paired differences and chances of improvement, both in %, actions drawn", drawn[2], compared_columns
+    )
     for name, rows in (
         ("runs", runs), ("models", every), ("distance", far), ("middle", middle), ("compared", compared),
     ):  # fmt: skip

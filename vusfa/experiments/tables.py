@@ -35,7 +35,7 @@ from vusfa.experiments.experiment import Experiment
 from vusfa.modules.config import MODELS
 
 __all__ = [
-    "COLUMNS",
+    "columns",
     "comparison_rows",
     "distance_rows",
     "middle_rows",
@@ -45,11 +45,14 @@ __all__ = [
 
 Row = dict[str, Any]
 
-#: The columns of a table: all metrics but ``length``, which ``length_ratio`` compares with the shortest path.
-COLUMNS = [metric.name for metric in metrics_within((500, 100), 500) if metric.name != "length"]
 COMPARED = ("success_500", "success_100", "spl")
 #: Trained goals count as solved from this share of their episodes on.
 SOLVED = 0.9
+
+
+def columns() -> list[str]:
+    """All metrics but ``length``, which ``length_ratio`` compares with the shortest path."""
+    return [metric.name for metric in metrics_within((500, 100), 500) if metric.name != "length"]
 
 
 def run_rows(experiment: Experiment) -> list[Row]:

@@ -40,22 +40,22 @@ function drawOverview() {
   const name = $("measure").value;
   const summary = rowsOf("summary");
   const models = summary.filter((row) => row.kind === "model");
-  const shown = models.map((row) => row.model);
+  const shown = models.map((row) => plain(row.model));
   const traces = models.map((row) => {
     const colour = colourOf(row.model);
     const [mean, low, high] = [row[name], row[`${name}_from`], row[`${name}_to`]].map((value) => scaled(name, value));
     return {
-      type: "scatter", mode: "markers", x: [mean], y: [row.model], showlegend: false,
+      type: "scatter", mode: "markers", x: [mean], y: [plain(row.model)], showlegend: false,
       marker: { color: colour, size: 15, symbol: SYMBOLS[place(row.model) % 8], line: { color: css("--panel"), width: 1.5 } },
       error_x: { type: "data", symmetric: false, array: [Math.max(0, high - mean)], arrayminus: [known(low) ? Math.max(0, mean - low) : 0], color: colour, thickness: 2.5, width: 0 },
-      hovertemplate: `<b>${row.model}</b><br>mean of ${row.seeds} seed${row.seeds > 1 ? "s" : ""}: %{x:.1f}<br>95 % interval ${low?.toFixed(1)} to ${high?.toFixed(1)}<extra></extra>`,
+      hovertemplate: `<b>${plain(row.model)}</b><br>mean of ${row.seeds} seed${row.seeds > 1 ? "s" : ""}: %{x:.1f}<br>95 % interval ${low?.toFixed(1)} to ${high?.toFixed(1)}<extra></extra>`,
     };
   });
   const seeds = rowsOf("seeds").filter((row) => known(row[name]));
   traces.unshift({
-    type: "scatter", mode: "markers", showlegend: false, x: seeds.map((row) => scaled(name, row[name])), y: seeds.map((row) => row.model),
+    type: "scatter", mode: "markers", showlegend: false, x: seeds.map((row) => scaled(name, row[name])), y: seeds.map((row) => plain(row.model)),
     marker: { size: 7, color: seeds.map((row) => faded(colourOf(row.model), 0.55)) },
-    text: seeds.map((row) => `${row.model}, seed ${row.seed}`), hovertemplate: "%{text}: %{x:.1f}<extra></extra>",
+    text: seeds.map((row) => `${plain(row.model)}, seed ${row.seed}`), hovertemplate: "%{text}: %{x:.1f}<extra></extra>",
   });
   const beside = summary.filter((row) => row.kind === "reference" && known(row[name]));
   const lines = beside.map((row) => ({
@@ -65,7 +65,7 @@ function drawOverview() {
   const values = [...traces.flatMap((trace) => trace.x), ...beside.map((row) => scaled(name, row[name]))].filter(known);
   const most = Math.max(...values, 0);
   const notes = beside.map((row, i) => ({
-    text: row.model, yshift: narrow() ? 14 * i : 0, x: scaled(name, row[name]), xref: "x", y: 1, yref: "paper", yanchor: "bottom", showarrow: false, font: { color: css("--muted"), size: 12 },
+    text: plain(row.model), yshift: narrow() ? 14 * i : 0, x: scaled(name, row[name]), xref: "x", y: 1, yref: "paper", yanchor: "bottom", showarrow: false, font: { color: css("--muted"), size: 12 },
     xanchor: scaled(name, row[name]) > 0.85 * most ? "right" : scaled(name, row[name]) < 0.1 * most ? "left" : "center",
   }));
   plot("overview", traces, {
@@ -111,11 +111,11 @@ function drawDistance() {
     const rows = DATA.tables.distance.filter((row) => row.model === model.label);
     const value = (row, end = "") => scaled(name, row[name + end]);
     return {
-      type: "scatter", mode: "lines+markers", name: model.label, x: rows.map((row) => row.distance), y: rows.map((row) => value(row)),
+      type: "scatter", mode: "lines+markers", name: plain(model.label), x: rows.map((row) => row.distance), y: rows.map((row) => value(row)),
       line: { color: colourOf(model.label), width: 2.5, dash: DASHES[place(model.label) % 8] },
       marker: { size: 9, symbol: SYMBOLS[place(model.label) % 8], color: colourOf(model.label) },
       error_y: { type: "data", symmetric: false, array: rows.map((row) => value(row, "_high") - value(row)), arrayminus: rows.map((row) => value(row) - value(row, "_low")), thickness: 1.5, width: 4, color: colourOf(model.label) },
-      text: rows.map((row) => `${grouped(row.num_goals)} goals, ${row.seeds} seed${row.seeds > 1 ? "s" : ""}`), hovertemplate: `<b>${model.label}</b><br>%{y:.1f} %, %{text}<extra></extra>`,
+      text: rows.map((row) => `${grouped(row.num_goals)} goals, ${row.seeds} seed${row.seeds > 1 ? "s" : ""}`), hovertemplate: `<b>${plain(model.label)}</b><br>%{y:.1f} %, %{text}<extra></extra>`,
     };
   }).filter((trace) => trace.x.length);
   plot("distance-plot", traces, {
@@ -155,7 +155,7 @@ function drawCurves() {
       traces.push({ ...edge, y: low }, { ...edge, y: high, fill: "tonexty", fillcolor: faded(colour, 0.2) });
     }
     traces.push({
-      type: "scatter", mode: "lines", x, y: mean, name: `${curve.model} (${curve.seeds} seed${curve.seeds > 1 ? "s" : ""})`, legendgroup: curve.model,
+      type: "scatter", mode: "lines", x, y: mean, name: `${plain(curve.model)} (${curve.seeds} seed${curve.seeds > 1 ? "s" : ""})`, legendgroup: curve.model,
       line: { color: colour, width: 2.5, dash: DASHES[place(curve.model) % 8] }, hovertemplate: "%{y:.4g}",
     });
   }

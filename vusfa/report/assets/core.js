@@ -11,6 +11,17 @@ function make(tag, attributes = {}, ...children) {
   return element;
 }
 
+// Elements are built, never parsed from text: a name in the data can be no markup.
+function svg(tag, attributes = {}, ...children) {
+  const element = document.createElementNS("http://www.w3.org/2000/svg", tag);
+  for (const [name, value] of Object.entries(attributes)) element.setAttribute(name, value);
+  element.append(...children);
+  return element;
+}
+
+// Plotly reads a few tags and its own %{fields} in its texts.
+const plain = (text) => String(text).replaceAll("&", "&amp;").replaceAll("<", "&lt;").replaceAll("%{", "% {");
+
 function fill(select, options, chosen) {
   select.replaceChildren(...options.map(([value, words]) => make("option", { value }, words)));
   if (options.some(([value]) => String(value) === String(chosen))) select.value = chosen;

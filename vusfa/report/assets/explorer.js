@@ -79,24 +79,25 @@ function drawArrows() {
     const point = (along, aside) => `${(x + along * dx - aside * dy).toFixed(3)} ${(y + along * dy + aside * dx).toFixed(3)}`;
     drawn[level] += `M${point(-0.11, 0)}L${point(0.12, 0)}M${point(0.03, 0.075)}L${point(0.12, 0)}L${point(0.03, -0.075)}`;
   }
-  host.innerHTML = drawn.map((d, level) => (d ? `<g opacity="${[0.25, 0.5, 0.75, 1][level]}"><path class="arrow-under" d="${d}"/><path class="arrow" d="${d}"/></g>` : "")).join("");
+  const groups = drawn.map((d, level) => d && svg("g", { opacity: [0.25, 0.5, 0.75, 1][level] }, svg("path", { class: "arrow-under", d }), svg("path", { class: "arrow", d })));
+  host.replaceChildren(...groups.filter(Boolean));
 }
 
 function dart(state, size, fill, edge) {
   const { centres } = drawing(sceneNow()), [x, y] = centres[state], heading = DATA.scenes[sceneNow()].heading[state];
   const corners = [[0, 1], [140, 1], [180, 0.35], [220, 1]].map(([turn, reach]) => towards(heading + turn, reach * size)).map(([dx, dy]) => `${(x + dx).toFixed(3)},${(y + dy).toFixed(3)}`);
-  return `<polygon points="${corners.join(" ")}" fill="${fill}" stroke="${edge}" stroke-width="${size * 0.2}" stroke-linejoin="round"/>`;
+  return svg("polygon", { points: corners.join(" "), fill, stroke: edge, "stroke-width": size * 0.2, "stroke-linejoin": "round" });
 }
 
 function drawWalk() {
   const scene = sceneNow(), goal = Number($("x-goal").value), { x, y, width } = drawing(scene), size = Math.max(0.42, width * 0.026);
   const line = (states) => states.map((state) => `${x[state].toFixed(2)},${y[state].toFixed(2)}`).join(" ");
   const stroke = Math.max(0.13, width * 0.008);
-  at.map.layer("trail").innerHTML = `<polyline class="trail" points="${line(at.way)}" stroke="#10151a" stroke-width="${stroke * 1.7}" opacity="0.25"/>
-    <polyline class="trail" points="${line(at.way.slice(0, at.step + 1))}" stroke="#10151a" stroke-width="${stroke * 1.9}"/>
-    <polyline class="trail" points="${line(at.way.slice(0, at.step + 1))}" stroke="#ffffff" stroke-width="${stroke}"/>`;
+  const trail = (states, color, thickness, opacity = 1) => svg("polyline", { class: "trail", points: line(states), stroke: color, "stroke-width": thickness, opacity });
+  const walked = at.way.slice(0, at.step + 1);
+  at.map.layer("trail").replaceChildren(trail(at.way, "#10151a", stroke * 1.7, 0.25), trail(walked, "#10151a", stroke * 1.9), trail(walked, "#ffffff", stroke));
   const state = at.way[at.step];
-  at.map.layer("marks").innerHTML = dart(goal, size, "var(--goal)", "#ffffff") + dart(state, size * 0.92, "var(--agent)", "var(--agent-edge)");
+  at.map.layer("marks").replaceChildren(dart(goal, size, "var(--goal)", "#ffffff"), dart(state, size * 0.92, "var(--agent)", "var(--agent-edge)"));
   showPicture($("x-view"), scene, state);
   showPicture($("x-target"), scene, goal);
   $("x-step").max = at.way.length - 1;

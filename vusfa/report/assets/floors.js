@@ -45,13 +45,16 @@ function floorMap(host, scene, label, small = false) {
   const { paths, width, height } = drawing(scene);
   const plan = DATA.scenes[scene];
   const letter = small ? width * 0.055 : Math.max(0.35, width * 0.026); // a letter's height
-  const ruler = plan.metric
-    ? `<path class="ruler" stroke-width="${letter * 0.12}" d="M0.1 ${height + 0.35}v${letter * 0.5}h${(1 / plan.cell).toFixed(3)}v-${letter * 0.5}"/><text class="ruler-text" font-size="${letter}" x="${0.1 + 1 / plan.cell + letter * 0.5}" y="${height + 0.35 + letter * 0.7}">1 m</text>`
-    : "";
-  host.innerHTML = `<svg viewBox="-0.1 -0.1 ${width + 0.2} ${height + 0.5 + letter}" role="img" aria-label="${label}">
-    <g class="slices">${paths.map((d, i) => `<path class="s" data-i="${i}" d="${d}"/>`).join("")}</g>
-    <g class="arrows"></g><g class="trail"></g><g class="marks"></g>${ruler}</svg>`;
-  const slices = [...host.querySelectorAll("path.s")];
+  const slices = paths.map((d, i) => svg("path", { class: "s", "data-i": i, d }));
+  const ruler = !plan.metric ? [] : [
+    svg("path", { class: "ruler", "stroke-width": letter * 0.12, d: `M0.1 ${height + 0.35}v${letter * 0.5}h${(1 / plan.cell).toFixed(3)}v-${letter * 0.5}` }),
+    svg("text", { class: "ruler-text", "font-size": letter, x: 0.1 + 1 / plan.cell + letter * 0.5, y: height + 0.35 + letter * 0.7 }, "1 m"),
+  ];
+  const groups = ["arrows", "trail", "marks"].map((name) => svg("g", { class: name }));
+  host.replaceChildren(svg(
+    "svg", { viewBox: `-0.1 -0.1 ${width + 0.2} ${height + 0.5 + letter}`, role: "img", "aria-label": label },
+    svg("g", { class: "slices" }, ...slices), ...groups, ...ruler,
+  ));
   const layer = (name) => host.querySelector(`.${name}`);
   return {
     paint: (colour) => slices.forEach((path, i) => { const found = colour(i); path.style.fill = found === "none" ? "var(--wall)" : found; }),
@@ -109,7 +112,9 @@ function startMaps() {
       const map = floorMap(floor, row.scene, `${label}: success of every goal in ${words(row.scene)}`, true);
       const { centres, width } = drawing(row.scene);
       const size = Math.max(0.16, width * 0.011);
-      map.layer("marks").innerHTML = row.trained.map((goal) => `<circle class="trained" cx="${centres[goal][0]}" cy="${centres[goal][1]}" r="${size}" stroke-width="${size * 0.45}"/>`).join("");
+      map.layer("marks").replaceChildren(...row.trained.map(
+        (goal) => svg("circle", { class: "trained", cx: centres[goal][0], cy: centres[goal][1], r: size, "stroke-width": size * 0.45 }),
+      ));
       map.listen(
         (state, event) => {
           const name = $("map-measure").value;
