@@ -82,10 +82,8 @@ def print_tables(
     drawn = [[row for row in rows if row["mode"] == "sampled"] for rows in (far, middle, compared)]
     show("By actions from the nearest trained goal, actions drawn", drawn[0], ["distance", *names])
     show("Interquartile mean over seeds and scenes, actions drawn", drawn[1], ["goals", *names])
-    compared_columns = ["goals", "measure", "model", "against", "seeds", "difference", "improvement"]
-    show(
-        "Paired differences and chances of improvement, both in %, actions drawn", drawn[2], compared_columns
-    )
+    heads = ["goals", "measure", "model", "against", "seeds", "difference", "improvement"]
+    show("Paired differences and chances of improvement, both in %, actions drawn", drawn[2], heads)
     for name, rows in (
         ("runs", runs), ("models", every), ("distance", far), ("middle", middle), ("compared", compared),
     ):  # fmt: skip
