@@ -67,8 +67,7 @@ class SceneSet:
         offsets = np.cumsum([0, *sizes])
         tables = [successor_table(scene.graph) for scene in self.scenes]
         self.offsets = torch.from_numpy(offsets)
-        firsts = offsets[:-1]
-        self.successor = _joined([t.numpy() + n for (t, _), n in zip(tables, firsts, strict=True)])
+        self.successor = _joined([t.numpy() + n for (t, _), n in zip(tables, offsets[:-1], strict=True)])
         self.blocked = _joined([blocked.numpy() for _, blocked in tables])
         self.features = _joined([scene.features.numpy() for scene in self.scenes])
         self.location = _joined([scene.location.numpy() for scene in self.scenes])
