@@ -109,7 +109,7 @@ def test_one_thread_per_update_is_the_released_update_bit_for_bit() -> None:
     generator = torch.Generator().manual_seed(0)
     start = torch.randn(30, 7, generator=generator)
     one, other = nn.Parameter(start.clone()), nn.Parameter(start.clone())
-    optimizers = A3CRMSprop([one], threads=1), TFRMSprop([other], foreach=False)
+    optimizers = A3CRMSprop([one], threads=1), TFRMSprop([other])
     for scale in (1.0, 100.0, 1e-3):  # the second is clipped
         grad = scale * torch.randn(30, 7, generator=generator)
         for param, optimizer in zip((one, other), optimizers, strict=True):

@@ -35,7 +35,7 @@ def table_critic(states: int = 6, features: int = 2, goal: bool = False) -> Seq:
 
 
 def transcribed_targets(
-    td: TensorDict, critic: Mod, gamma: float, lmbda: float, bootstrap_at_timeout: bool, embedding_at: str
+    td: TensorDict, critic: Mod, gamma: float, lmbda: float, bootstrap_at_timeout: bool
 ) -> tuple[list, list, list]:
     """One row, one number at a time, backwards."""
     value, psi, phi = (table.tolist() for table in critic.tables)
@@ -55,7 +55,7 @@ def transcribed_targets(
             rest = (1 - lmbda) * value[following[t]][0] + lmbda * target[t + 1]
             psi_rest = [(1 - lmbda) * psi[following[t]][i] + lmbda * successor[t + 1][i] for i in features]
         target[t] = float(td["next", "reward"][t]) + gamma * rest
-        embedding = phi[following[t] if embedding_at == "next" else state[t]]
+        embedding = phi[following[t]]
         successor[t] = [embedding[i] + gamma * psi_rest[i] for i in features]
         advantage[t] = target[t] - value[state[t]][0]
     return advantage, target, successor
@@ -89,15 +89,12 @@ class TestTargets:
         gamma=st.floats(0, 1),
         lmbda=st.sampled_from([0.0, 0.3, 0.95, 1.0]),
         bootstrap_at_timeout=st.booleans(),
-        embedding_at=st.sampled_from(["next", "current"]),
     )
     @settings(max_examples=80, deadline=None)
-    def test_equal_a_plain_transcription(
-        self, batch, seed, ends, gamma, lmbda, bootstrap_at_timeout, embedding_at
-    ) -> None:
+    def test_equal_a_plain_transcription(self, batch, seed, ends, gamma, lmbda, bootstrap_at_timeout) -> None:
         td = table_rollout(*batch, seed=seed, ends=ends)
         critic = table_critic()
-        options = {"bootstrap_at_timeout": bootstrap_at_timeout, "embedding_at": embedding_at}
+        options = {"bootstrap_at_timeout": bootstrap_at_timeout}
         estimator = USFEstimator(value_network=critic, gamma=gamma, lmbda=lmbda, **options)
         result = estimator(td)
         assert result is td
@@ -133,23 +130,6 @@ class TestTargets:
         assert td["advantage"].squeeze(-1).tolist() == [0.0, 0.0, 0.25, 0.5]
         # 2.5 and nothing more; 6.5 + 60/2; 8.5 + 54.5/2; 9.5 + 90/2
         assert td["successor_target"].squeeze(-1).tolist() == [2.5, 36.5, 35.75, 54.5]
-
-    @pytest.mark.parametrize("n_steps", [1, 2, 100])
-    def test_n_steps(self, n_steps: int) -> None:
-        td = table_rollout(3, 6, seed=0, ends=0.0)
-        critic = table_critic()
-        USFEstimator(value_network=critic, gamma=0.5, n_steps=n_steps)(td)
-        value, psi, phi = critic.tables
-        for row in td:
-            for t in range(6):
-                last = min(t + n_steps, 6) - 1
-                steps = range(t, last + 1)
-                reward = sum(0.5 ** (k - t) * row["next", "reward"][k] for k in steps)
-                embedding = sum(0.5 ** (k - t) * phi[row["next", "state"][k]] for k in steps)
-                rest = 0.5 ** (last + 1 - t)
-                end = row["next", "state"][last]
-                torch.testing.assert_close(row["value_target"][t], reward + rest * value[end])
-                torch.testing.assert_close(row["successor_target"][t], embedding + rest * psi[end])
 
     def test_targets_are_constants(self, usf, rollout) -> None:
         networks = usf()
@@ -450,10 +430,7 @@ class TestErrors:
         [
             ({"gamma": 1.5}, "gamma is 1.5"),
             ({"lmbda": -0.1}, "lmbda is -0.1"),
-            ({"n_steps": 0}, "n_steps is 0"),
             ({"min_advantage_std": 0.0}, "min_advantage_std is 0.0"),
-            ({"n_steps": 3, "lmbda": 0.9}, "n_steps is 3 with lmbda 0.9"),
-            ({"embedding_at": "previous"}, "embedding_at is 'previous'"),
         ],
     )
     def test_hyperparameters(self, wrong: dict, message: str) -> None:

@@ -124,8 +124,6 @@ class TestNumbers:
             ({"bottleneck_on": "both"}, 0.8125),
             ({"bottleneck_on": "state"}, 0.125),
             ({"bottleneck_on": "goal"}, 1.5),
-            ({"bottleneck_on": "both", "information_reduction": "sum"}, 1.625),
-            ({"bottleneck_on": "goal", "information_reduction": "sum"}, 3.0),
         ],
     )
     def test_information(self, options: dict[str, str], kl: float) -> None:
@@ -143,10 +141,6 @@ class TestNumbers:
         assert not any(losses[key].requires_grad for key in DIAGNOSTICS)
         assert loss.last_kl.item() == losses["kl"].item()
         assert not loss.last_kl.requires_grad
-
-    @pytest.mark.parametrize(("kind", "expected"), [("l1", 1.5), ("l2", 2.5), ("smooth_l1", 1.0)])
-    def test_kinds_of_value_loss(self, kind: str, expected: float) -> None:
-        assert self.loss(loss_critic_type=kind)(self.data)["loss_critic"].item() == pytest.approx(expected)
 
     def test_terms_as_methods(self) -> None:
         loss = self.loss(reduction="none", information_target=0.5)
@@ -349,8 +343,7 @@ class TestOtherActions:
 
 
 class TestKnownDivergence:
-    @pytest.mark.parametrize("reduction", ["mean", "sum"])
-    def test_what_the_critic_writes_is_taken(self, usf, rollout, reduction: str) -> None:
+    def test_what_the_critic_writes_is_taken(self, usf, rollout) -> None:
         """A critic that writes the divergences itself: the same term, and no mean or scale is looked at."""
         networks, td = usf(), rollout(2, 4)
 
@@ -362,7 +355,7 @@ class TestKnownDivergence:
             Mod(divergence, in_keys=[f"{name}_loc", f"{name}_scale"], out_keys=[f"{name}_kl"])
             for name in ("state", "goal")
         ]
-        options = {"bottleneck_coeff": 0.5, "information_reduction": reduction}
+        options = {"bottleneck_coeff": 0.5}
         plain = USFLoss(networks.actor, networks.critic, **options)(td)
         known = USFLoss(networks.actor, Seq(networks.critic, *extra), **options)(td)
         torch.testing.assert_close(known["kl"], plain["kl"])

@@ -239,8 +239,6 @@ class TestModule:
         ("wrong", "message"),
         [
             ({"bottleneck_on": "policy"}, "bottleneck_on is 'policy'"),
-            ({"information_reduction": "max"}, "information_reduction is 'max'"),
-            ({"loss_critic_type": "l3"}, "loss_critic_type is 'l3'"),
             ({"reduction": "product"}, "reduction is 'product'"),
             ({"entropy_coeff": True}, "entropy_coeff must be a float"),
             ({"critic_coeff": torch.ones(2)}, "critic_coeff must be a float"),

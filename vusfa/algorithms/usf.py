@@ -21,16 +21,8 @@ from vusfa.scenes import SceneSet
 __all__ = ["USF", "make_usf_loss"]
 
 # arguments of USFEstimator and of DualAscent among the settings of objective; the others are USFLoss's
-_OF_TARGETS = (
-    "gamma",
-    "lmbda",
-    "n_steps",
-    "normalize_advantage",
-    "min_advantage_std",
-    "bootstrap_at_timeout",
-    "embedding_at",
-)
-_OF_ASCENT = {"bottleneck_step_size": "step_size", "bottleneck_maximum": "maximum"}
+_OF_TARGETS = ("gamma", "lmbda", "normalize_advantage", "min_advantage_std", "bootstrap_at_timeout")
+_OF_ASCENT = {"bottleneck_step_size": "step_size"}
 # buffers of the loss that training moves; the others are settings
 _ADAPTED = ("bottleneck_coeff", "last_kl")
 

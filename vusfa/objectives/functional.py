@@ -27,7 +27,6 @@ __all__ = [
     "gaussian_kl",
     "information_bottleneck",
     "lambda_return",
-    "n_step_return",
     "policy_gradient_loss",
     "successor_loss",
     "successor_return",
@@ -92,60 +91,6 @@ def lambda_return(
         value = cumulants[time] + gamma * value
         returns.append(value)
     return torch.stack(returns[::-1], time_dim)
-
-
-def n_step_return(
-    cumulant: Tensor,
-    next_value: Tensor,
-    gamma: float | Tensor,
-    n: int,
-    done: Tensor,
-    terminated: Tensor,
-    *,
-    time_dim: int = -2,
-) -> Tensor:
-    r"""Returns over at most ``n`` steps, each bootstrapped where it stops.
-
-    .. math::
-        G^{(n)}_t = \sum_{k=0}^{m-1} \gamma^k c_{t+k} + \gamma^m v(s_{t+m}), \qquad m \le n
-
-    ``m`` is smaller than ``n`` where the episode or the rollout ends first; beyond a terminal the second term
-    is 0.
-
-    Args:
-        cumulant: ``(*batch, T, F)``.
-        next_value: ``(*batch, T, F)``, the estimate at ``s_{t+1}``.
-        gamma: discount per step.
-        n: steps, at least 1. From ``T`` on it equals :func:`lambda_return` with ``lmbda=1``.
-        done: ``(*batch, T, 1)`` or ``(*batch, T, F)``, bool.
-        terminated: as ``done``.
-        time_dim: the dimension of time.
-
-    Returns:
-        ``(*batch, T, F)``.
-
-    Raises:
-        ValueError: when ``n`` is smaller than 1 or shapes do not fit each other.
-
-    >>> reward, next_value = torch.ones(4, 1), torch.full((4, 1), 8.0)
-    >>> no = torch.zeros(4, 1, dtype=torch.bool)
-    >>> n_step_return(reward, next_value, 0.5, 2, no, no).squeeze(-1)
-    tensor([3.5000, 3.5000, 3.5000, 5.0000])
-    """
-    _assert_transitions(cumulant, next_value, done, terminated, time_dim)
-    if n < 1:
-        raise ValueError(f"n_step_return: n is {n}; give at least 1")
-    steps = cumulant.shape[time_dim]
-    bootstrap = torch.where(terminated, 0.0, next_value)
-    value = bootstrap
-    returns = cumulant + gamma * value
-    for _ in range(min(n, steps) - 1):
-        # the (k+1)-step return of t holds the k-step return of t+1, unless something ended in between
-        later = torch.cat(
-            [returns.narrow(time_dim, 1, steps - 1), bootstrap.narrow(time_dim, steps - 1, 1)], time_dim
-        )
-        returns = cumulant + gamma * torch.where(done, bootstrap, later)
-    return returns
 
 
 def successor_return(
@@ -272,16 +217,13 @@ def information_bottleneck(kl: Tensor, beta: float | Tensor, information_target:
     return beta * (kl - information_target)
 
 
-def dual_ascent(
-    multiplier: Tensor, violation: Tensor, step_size: float | Tensor, maximum: float | None = None
-) -> Tensor:
+def dual_ascent(multiplier: Tensor, violation: Tensor, step_size: float | Tensor) -> Tensor:
     r"""One step of a constraint's multiplier, :math:`\beta \leftarrow \max(0, \beta + \alpha (KL - I_c))`.
 
     Args:
         multiplier: beta, any shape.
         violation: by how much the constraint is broken, ``KL - I_c``; negative where it holds.
         step_size: alpha.
-        maximum: where to stop; ``None`` for nowhere.
 
     Returns:
         the new multiplier, not differentiable.
@@ -292,7 +234,7 @@ def dual_ascent(
     tensor(0.)
     """
     multiplier, violation = multiplier.detach(), violation.detach()
-    return (multiplier + step_size * violation).clamp(min=0.0, max=maximum)
+    return (multiplier + step_size * violation).clamp(min=0.0)
 
 
 def explained_variance(target: Tensor, prediction: Tensor, mask: Tensor | None = None) -> Tensor:

@@ -39,8 +39,6 @@ class TFRMSprop(Optimizer):
         eps: added INSIDE the root.
         initial_accumulator: m before the first step. A tensor gets its accumulator with its first gradient.
         max_grad_norm: c, the largest norm of one tensor's gradient; ``None`` leaves gradients as they are.
-        foreach: all tensors of a group in a few kernels, or one after the other; ``None`` for what the device
-            favours.
 
     Raises:
         ValueError: for a hyperparameter out of its range.
@@ -62,8 +60,6 @@ class TFRMSprop(Optimizer):
         eps: float = 0.1,
         initial_accumulator: float = 1.0,
         max_grad_norm: float | None = 40.0,
-        *,
-        foreach: bool | None = None,
     ) -> None:
         ranges = {
             "lr": (lr, lr >= 0),
@@ -83,7 +79,6 @@ class TFRMSprop(Optimizer):
                 "eps": eps,
                 "initial_accumulator": initial_accumulator,
                 "max_grad_norm": max_grad_norm,
-                "foreach": foreach,
             },
         )
 
@@ -104,10 +99,8 @@ class TFRMSprop(Optimizer):
         for group in self.param_groups:
             params, grads, accumulators = self._gather(group)
             if params:
-                foreach = group["foreach"]
-                if foreach is None:
-                    # few kernels count on a GPU; a tensor at a time stays in a CPU's cache: twice as fast
-                    foreach = all(param.is_cuda for param in params)
+                # few kernels count on a GPU; a tensor at a time stays in a CPU's cache: twice as fast
+                foreach = all(param.is_cuda for param in params)
                 update = _update_foreach if foreach else _update_one_by_one
                 update(
                     params,
@@ -189,7 +182,6 @@ class DualAscent:
     Args:
         loss: a :class:`~vusfa.objectives.USFLoss` with a bottleneck term.
         step_size: alpha; the paper's code has 1e-6.
-        maximum: where beta stops; ``None`` for nowhere.
 
     Raises:
         ValueError: when the loss has no bottleneck term, or a number is out of its range.
@@ -218,7 +210,7 @@ class DualAscent:
     tensor(0.1500)
     """
 
-    def __init__(self, loss: USFLoss, step_size: float = 1e-6, maximum: float | None = None) -> None:
+    def __init__(self, loss: USFLoss, step_size: float = 1e-6) -> None:
         if getattr(loss, "bottleneck_coeff", None) is None or not loss.has_bottleneck:
             raise ValueError(
                 "DualAscent: the loss has no bottleneck term; give USFLoss a bottleneck_coeff (0.0 will do) "
@@ -226,19 +218,14 @@ class DualAscent:
             )
         if step_size < 0:
             raise ValueError(f"DualAscent: step_size is {step_size}; give 0 or more")
-        if maximum is not None and maximum < 0:
-            raise ValueError(f"DualAscent: maximum is {maximum}; give 0 or more, or None")
         self.loss = loss
         self.step_size = step_size
-        self.maximum = maximum
 
     def step(self) -> None:
         """Move beta by one step, in place."""
         loss = self.loss
         violation = loss.last_kl - loss.information_target
-        loss.bottleneck_coeff.copy_(
-            dual_ascent(loss.bottleneck_coeff, violation, self.step_size, self.maximum)
-        )
+        loss.bottleneck_coeff.copy_(dual_ascent(loss.bottleneck_coeff, violation, self.step_size))
 
     def __repr__(self) -> str:
         beta, target = float(self.loss.bottleneck_coeff), float(self.loss.information_target)

@@ -22,7 +22,7 @@ from torchrl.modules import set_recurrent_mode
 from torchrl.objectives.value import ValueEstimatorBase
 
 from vusfa.modules.unique import gather
-from vusfa.objectives.functional import lambda_return, n_step_return
+from vusfa.objectives.functional import lambda_return
 from vusfa.objectives.keys import EstimatorKeys
 
 __all__ = ["USFEstimator"]
@@ -54,14 +54,10 @@ class USFEstimator(ValueEstimatorBase):
         gamma: discount per step.
         lmbda: weight of the longer return, in [0, 1]; 1 is the n-step return up to the rollout's end, 0 the
             one-step target.
-        n_steps: bootstrap after this many steps at the latest; ``None`` for the rollout's end. Needs
-            ``lmbda=1``.
         normalize_advantage: shift and scale the advantages of a batch to mean 0 and deviation 1.
         min_advantage_std: divide by no less than this. While rewards are rare all advantages are small errors
             of the critic; brought to deviation 1 they would drive the policy somewhere at random.
         bootstrap_at_timeout: ``False`` takes a time-out for a terminal, as the paper's released code does.
-        embedding_at: ``"next"`` sums the embeddings from s_{t+1} on (the paper's Eqs. 4 and 13 and its code),
-            ``"current"`` from s_t on (its Eq. 6).
         device: accepted for TorchRL's sake; the estimator follows its input.
 
     Raises:
@@ -93,11 +89,9 @@ class USFEstimator(ValueEstimatorBase):
         value_network: TensorDictModuleBase,
         gamma: float = 0.99,
         lmbda: float = 1.0,
-        n_steps: int | None = None,
         normalize_advantage: bool = False,
         min_advantage_std: float = 1e-4,
         bootstrap_at_timeout: bool = True,
-        embedding_at: str = "next",
         device: torch.device | str | None = None,
     ) -> None:
         super().__init__(value_network=value_network, device=device)
@@ -106,21 +100,13 @@ class USFEstimator(ValueEstimatorBase):
             raise ValueError(f"USFEstimator: gamma is {gamma}; give a number in [0, 1]")
         if not 0.0 <= lmbda <= 1.0:
             raise ValueError(f"USFEstimator: lmbda is {lmbda}; give a number in [0, 1]")
-        if n_steps is not None and (n_steps < 1 or lmbda != 1.0):
-            raise ValueError(
-                f"USFEstimator: n_steps is {n_steps} with lmbda {lmbda}; give at least 1, with lmbda 1"
-            )
-        if embedding_at not in ("next", "current"):
-            raise ValueError(f"USFEstimator: embedding_at is {embedding_at!r}; give 'next' or 'current'")
         if not min_advantage_std > 0.0:
             raise ValueError(f"USFEstimator: min_advantage_std is {min_advantage_std}; give a number above 0")
         self.gamma = gamma
         self.lmbda = lmbda
-        self.n_steps = n_steps
         self.normalize_advantage = normalize_advantage
         self.min_advantage_std = min_advantage_std
         self.bootstrap_at_timeout = bootstrap_at_timeout
-        self.embedding_at = embedding_at
 
     @property
     def has_successor(self) -> bool:
@@ -212,27 +198,28 @@ class USFEstimator(ValueEstimatorBase):
         mask = data.get(MASK_KEY, None)
         ended = _cut_at_padding(done, mask)
 
-        wanted, at_root = [keys.value], [keys.value]
+        wanted = [keys.value]
         if self.has_successor:
             wanted += [keys.successor_features, keys.state_embedding]
-            at_root += [keys.state_embedding] if self.embedding_at == "current" else []
         with (
             contextlib.nullcontext()
             if params is None
             else params.to_module(self.value_network, preserve_module_state=False)
         ):
             root, following = evaluate_rollout(
-                self.value_network, data, ended.any(-1), wanted, written, index, at_root
+                self.value_network, data, ended.any(-1), wanted, written, index, [keys.value]
             )
         value, next_value = root[0].to(reward.dtype), following[0].to(reward.dtype)
         if not self.has_successor:
             value_target = self._return(reward, next_value, ended, terminated)
         else:
-            embedding = following[2] if self.embedding_at == "next" else root[1]
-            # reward and embedding are summed by the same recursion
+            # reward and embedding (of s_{t+1} on: the paper's Eqs. 4 and 13 and its code, not its Eq. 6) are
+            # summed by the same recursion
             ends = ended.any(-1, keepdim=True), terminated.any(-1, keepdim=True)
             value_target = self._return(reward, next_value, *ends)
-            successor_target = self._return(embedding.to(reward.dtype), following[1].to(reward.dtype), *ends)
+            successor_target = self._return(
+                following[2].to(reward.dtype), following[1].to(reward.dtype), *ends
+            )
         advantage = value_target - value
         if self.normalize_advantage:
             advantage = _normalize(advantage, mask, self.min_advantage_std)
@@ -244,8 +231,6 @@ class USFEstimator(ValueEstimatorBase):
         return targets
 
     def _return(self, cumulant: Tensor, next_value: Tensor, done: Tensor, terminated: Tensor) -> Tensor:
-        if self.n_steps is not None:
-            return n_step_return(cumulant, next_value, self.gamma, self.n_steps, done, terminated)
         return lambda_return(cumulant, next_value, self.gamma, self.lmbda, done, terminated)
 
 

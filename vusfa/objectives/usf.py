@@ -97,12 +97,9 @@ class USFLoss(LossModule):
         successor_coeff: c_psi; the paper's code has 5e-4 beside losses SUMMED over its 5 steps.
         entropy_coeff: c_H.
         bottleneck_coeff: beta, where it starts; :class:`~vusfa.objectives.DualAscent` adapts it.
-        information_target: I_c, in nats per feature of the latent, or in all with
-            ``information_reduction="sum"``.
+        information_target: I_c, in nats per feature of the latent.
         bottleneck_on: ``"both"``, ``"goal"`` or ``"state"``: the branches whose information counts, as far as
             the critic writes them.
-        information_reduction: ``"mean"`` or ``"sum"`` over the latent's features.
-        loss_critic_type: ``"l2"`` (the square, not halved), ``"l1"`` or ``"smooth_l1"``.
         reduction: ``"mean"``, ``"sum"`` or ``"none"`` over steps.
         functional: whether the networks' parameters are held as tensordicts apart from the modules.
         separate_losses: whether parameters that both networks hold are trained by the policy's loss alone.
@@ -180,8 +177,6 @@ class USFLoss(LossModule):
         bottleneck_coeff: float | None = 0.0,
         information_target: float = 0.2,
         bottleneck_on: Literal["both", "goal", "state"] = "both",
-        information_reduction: Literal["mean", "sum"] = "mean",
-        loss_critic_type: Literal["l1", "l2", "smooth_l1"] = "l2",
         reduction: Literal["none", "mean", "sum"] | None = "mean",
         functional: bool = True,
         separate_losses: bool = False,
@@ -189,8 +184,6 @@ class USFLoss(LossModule):
     ) -> None:
         reduction = reduction or "mean"
         _check_choice("bottleneck_on", bottleneck_on, ("both", "goal", "state"))
-        _check_choice("information_reduction", information_reduction, ("mean", "sum"))
-        _check_choice("loss_critic_type", loss_critic_type, ("l1", "l2", "smooth_l1"))
         _check_choice("reduction", reduction, ("none", "mean", "sum"))
         if separate_losses and not functional:
             raise ValueError("USFLoss: separate_losses=True needs functional=True")
@@ -212,8 +205,6 @@ class USFLoss(LossModule):
         self.separate_losses = separate_losses
         self.distinct = distinct and not separate_losses and ends_in_distribution(actor_network)
         self.bottleneck_on = bottleneck_on
-        self.information_reduction = information_reduction
-        self.loss_critic_type = loss_critic_type
         self.reduction = reduction
         device, dtype = self._default_device, torch.get_default_dtype()
         values = (objective_coeff, critic_coeff, successor_coeff, entropy_coeff, bottleneck_coeff)
@@ -349,10 +340,10 @@ class USFLoss(LossModule):
     def loss_critic(
         self, tensordict: TensorDictBase, results: Results | None = None
     ) -> tuple[Tensor, Tensor]:
-        """The value's term, ``c_V (G - V)^2`` for l2, ``(*batch,)``, and the variance that V explains."""
+        """The value's term, ``c_V (G - V)^2``, ``(*batch,)``, and the variance that V explains."""
         target = self._target(tensordict, "value_target").detach()
         value = (results or self._evaluate(tensordict)).written.get(self.tensor_keys.value).to(target.dtype)
-        distance = distance_loss(target, value, loss_function=self.loss_critic_type).squeeze(-1)
+        distance = distance_loss(target, value, loss_function="l2").squeeze(-1)
         return self.critic_coeff * distance, explained_variance(
             target, value, self._valid(tensordict, target)
         )
@@ -472,11 +463,9 @@ class USFLoss(LossModule):
         return [branches[name] for name in chosen if self._writes(*branches[name][:2])]
 
     def _divergence(self, results: Results, branch: tuple[NestedKey, NestedKey, NestedKey]) -> Tensor:
-        """KL of one latent, ``(*batch,)``, its features reduced."""
+        """KL of one latent, ``(*batch,)``, the mean over its features."""
         (loc, scale, known), written = branch, results.written
-        features = 1
-        if self.information_reduction == "mean":
-            features = results.latent_size or written.get(loc).shape[-1]
+        features = results.latent_size or written.get(loc).shape[-1]
         if self._writes(known):
             return written.get(known).squeeze(-1) / features
         return gaussian_kl(written.get(loc), written.get(scale)).sum(-1) / features
