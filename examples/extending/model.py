@@ -1,14 +1,17 @@
-"""A fifth model: a policy whose hidden state is gated by psi. One class, one line of registration.
+"""A fifth model in one file: a policy whose hidden state is gated by psi.
 
-``python examples/extending/model.py`` prints what it is made of.
+python examples/extending/model.py agent.model=gated scenes=[bathroom]
 """
 
 from __future__ import annotations
 
+from typing import Any
+
 from torch import Tensor, nn
 
-from vusfa.modules import Agent, AgentConfig, Model, PolicyHead, make_agent, register_model
-from vusfa.scenes import SceneSet
+from vusfa.cli.launch import launch
+from vusfa.experiments.training import train
+from vusfa.modules import Agent, AgentConfig, Model, PolicyHead, register_model
 
 
 class GatedPolicyHead(nn.Module):
@@ -34,5 +37,11 @@ class GatedAgent(Agent):
 
 register_model("gated", Model(True, True, False, GatedAgent))
 
+
+def main(settings: dict[str, Any], overrides: list[str]) -> int:
+    """Trains and evaluates like ``vusfa train``."""
+    return train(settings, overrides).exit_code
+
+
 if __name__ == "__main__":
-    print(make_agent("gated", scenes=SceneSet.bundled(["bathroom"]), history=1))
+    launch(main)

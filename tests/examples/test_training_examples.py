@@ -1,8 +1,9 @@
-"""Examples of an algorithm and of a loss term: trained as a script, resumed, evaluated like any other."""
+"""Examples of a model, an algorithm and a loss term: trained as a script, resumed, evaluated like any."""
 
 from __future__ import annotations
 
 import csv
+import runpy
 import subprocess
 import sys
 from pathlib import Path
@@ -10,6 +11,8 @@ from pathlib import Path
 import pytest
 import torch
 
+from vusfa.errors import VusfaError
+from vusfa.modules import MODELS
 from vusfa.training import load_agent, load_checkpoint
 
 EXAMPLES = Path(__file__).parents[2] / "examples" / "extending"
@@ -27,10 +30,16 @@ def start(example: str, *overrides: str, folder: Path) -> str:
     [
         ("algorithm", ["algorithm=ppo", "algorithm.epochs=3", "algorithm.clip=0.1"], "loss_objective"),
         ("loss_term", ["objective.terms.successor_size=0.01"], "loss_successor_size"),
+        ("model", ["agent.model=gated"], "loss_successor"),
     ],
 )
 def test_trained_resumed_and_evaluated(
-    scene_file: Path, tmp_path: Path, example: str, chosen: list[str], column: str
+    scene_file: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    example: str,
+    chosen: list[str],
+    column: str,
 ):
     settings = [
         *chosen,
@@ -59,6 +68,11 @@ def test_trained_resumed_and_evaluated(
     with open(tmp_path / "parts" / "metrics.csv", newline="") as file:
         assert all(float(row[column]) != 0 for row in csv.DictReader(file))
     assert (tmp_path / "parts" / "evaluation.csv").is_file()
+    if example == "model":
+        with pytest.raises(VusfaError, match="model is 'gated'"):  # a checkpoint names it; nothing is imported
+            load_agent(path)
+        monkeypatch.setattr("vusfa.modules.config.MODELS", dict(MODELS))
+        runpy.run_path(str(EXAMPLES / "model.py"))
     load_agent(path)
 
 
