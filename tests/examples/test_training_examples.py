@@ -69,7 +69,7 @@ def test_trained_resumed_and_evaluated(
         assert all(float(row[column]) != 0 for row in csv.DictReader(file))
     assert (tmp_path / "parts" / "evaluation.csv").is_file()
     if example == "model":
-        with pytest.raises(VusfaError, match="model is 'gated'"):  # a checkpoint names it; nothing is imported
+        with pytest.raises(VusfaError, match="model is 'gated'"):  # nothing is imported for it
             load_agent(path)
         monkeypatch.setattr("vusfa.modules.config.MODELS", dict(MODELS))
         runpy.run_path(str(EXAMPLES / "model.py"))
