@@ -8,7 +8,7 @@
 """
 
 from vusfa.deprecated import moved_names
-from vusfa.modules.agents import Agent, make_agent, transplant
+from vusfa.modules.agents import Agent, make_agent
 from vusfa.modules.autoencoder import explained_features, pretrain_autoencoder
 from vusfa.modules.bottleneck import GaussianBottleneck, LatentSampler, gaussian_kl
 from vusfa.modules.config import ARCHITECTURES, MODELS, AgentConfig, Model, register_model, resolve_config
@@ -20,6 +20,7 @@ from vusfa.modules.linear import HistoryLinear, SceneLinear
 from vusfa.modules.policy import PolicyHead, SuccessorPolicyHead
 from vusfa.modules.siamese import SiameseEncoder
 from vusfa.modules.successor import RewardHead, SuccessorHead, SuccessorValue, ValueHead
+from vusfa.modules.transplanting import transplant
 from vusfa.modules.trunk import Fusion, SceneLayer
 from vusfa.modules.unique import gather, unique_rows
 from vusfa.modules.upgrade import upgrade_agent_config, upgrade_agent_state

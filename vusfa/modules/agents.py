@@ -27,6 +27,7 @@ from torch.distributions import Categorical
 from torchrl.envs.transforms import InitTracker, Transform
 from torchrl.modules import LSTMModule
 
+from vusfa.deprecated import moved_names
 from vusfa.errors import ConfigError
 from vusfa.modules.bottleneck import GaussianBottleneck, LatentSampler
 from vusfa.modules.config import AgentConfig, resolve_config
@@ -36,7 +37,7 @@ from vusfa.modules.siamese import SiameseEncoder
 from vusfa.modules.successor import RewardHead, SuccessorHead, SuccessorValue, ValueHead
 from vusfa.modules.trunk import Fusion, SceneLayer, SiameseTrunk
 
-__all__ = ["Agent", "make_agent", "transplant"]
+__all__ = ["Agent", "make_agent"]
 
 
 def make_agent(model: str, architecture: str = "controlled", scenes: Any = None, **overrides: Any) -> Agent:
@@ -74,48 +75,6 @@ def make_agent(model: str, architecture: str = "controlled", scenes: Any = None,
             "make_agent needs scenes=...; SceneSet.bundled() gives the four that come with the package"
         )
     return (config.ideas.agent or Agent)(config, scenes)
-
-
-def transplant(agent: Agent, scenes: Any) -> Agent:
-    """A copy of an agent with ``shared_heads`` that lives in other scenes, with the same weights.
-
-    It looks at the new scenes as at those it was trained in: features are normalized by the mean and
-    deviation of the TRAINING scenes, which are among its weights. For equal features it gives equal numbers.
-
-    Args:
-        agent: built with ``shared_heads=True``.
-        scenes: a ``SceneSet`` with features of the same size and as many actions.
-
-    Returns:
-        an agent on the same device, training or evaluating as the given one does. No tensor is shared.
-
-    Raises:
-        ConfigError: the agent has heads of its own for each scene, or the scenes do not fit it.
-
-    >>> from vusfa.scenes import SceneSet
-    >>> home, other = SceneSet.bundled(["bathroom"]), SceneSet.bundled(["kitchen", "bedroom"])
-    >>> agent = make_agent("vusfa", scenes=home, hidden_size=8, embedding_size=8, shared_heads=True)
-    >>> transplant(agent, other).config["scenes"]
-    ['kitchen', 'bedroom']
-    """
-    if not agent.config["shared_heads"]:
-        raise ConfigError(
-            "the agent has heads of its own for each scene; train one with agent.shared_heads=true to take"
-            " it to other scenes"
-        )
-    if scenes.num_actions != agent.config["num_actions"]:
-        raise ConfigError(
-            f"the agent chooses among {agent.config['num_actions']} actions, the scenes have"
-            f" {scenes.num_actions}"
-        )
-    fields = {field.name for field in dataclasses.fields(AgentConfig)}
-    copy = make_agent(scenes=scenes, **{k: v for k, v in agent.config.items() if k in fields})
-    try:
-        copy.load_state_dict(agent.state_dict())
-    except RuntimeError as error:
-        first = str(error).splitlines()[-1].strip()
-        raise ConfigError(f"the agent does not fit the scenes' features ({first})") from error
-    return copy.to(next(agent.parameters()).device).train(agent.training)
 
 
 class Agent(nn.Module):
@@ -304,3 +263,6 @@ def _plain(config: AgentConfig, scenes: Any) -> dict[str, Any]:
     plain["fingerprint"] = scenes.fingerprint
     plain["num_actions"] = scenes.num_actions
     return plain
+
+
+__getattr__ = moved_names(__name__, {"transplant": "vusfa.modules.transplant"})

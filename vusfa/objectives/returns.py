@@ -1,16 +1,8 @@
-r"""The estimator that writes advantage, value target and successor target from one evaluation of the critic.
-
-Bootstrapping needs the critic at the states ``s_0 .. s_{T-1}`` that acted *and* at the states that their
-steps led to. In a rollout the latter are, but for a few, the former shifted by one. So the critic is
-evaluated once over a batch of the T root states and, beside them, only those next states that are not the
-next root: the last of each row, and those of steps that ended an episode in mid-rollout (whose next root
-already belongs to the next episode).
-"""
+"""The estimator that writes advantage, value target and successor target from one pass of the critic."""
 
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable
 from typing import Any
 
 import torch
@@ -18,12 +10,11 @@ from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase, dispatch
 from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor
-from torchrl.modules import set_recurrent_mode
 from torchrl.objectives.value import ValueEstimatorBase
 
-from vusfa.modules.unique import gather
 from vusfa.objectives.functional import lambda_return
 from vusfa.objectives.keys import EstimatorKeys
+from vusfa.objectives.rollout_values import evaluate_rollout
 
 __all__ = ["USFEstimator"]
 
@@ -232,116 +223,6 @@ class USFEstimator(ValueEstimatorBase):
 
     def _return(self, cumulant: Tensor, next_value: Tensor, done: Tensor, terminated: Tensor) -> Tensor:
         return lambda_return(cumulant, next_value, self.gamma, self.lmbda, done, terminated)
-
-
-def evaluate_rollout(
-    critic: Callable[[TensorDictBase], TensorDictBase],
-    data: TensorDictBase,
-    ended: Tensor,
-    out_keys: list[NestedKey],
-    written: TensorDictBase | None = None,
-    index: Tensor | None = None,
-    at_root: list[NestedKey] | None = None,
-) -> tuple[list[Tensor], list[Tensor]]:
-    """A critic's outputs at the states of a rollout and at those that its steps lead to.
-
-    Args:
-        critic: a tensordict module with ``in_keys``.
-        data: ``(*batch, T)``, the critic's inputs at the root and under ``"next"``; what ``"next"`` lacks (a
-            goal that stays) is taken from the root.
-        ended: ``(*batch, T)``, bool: the next root does not follow from this step.
-        out_keys: the outputs wanted.
-        written: ``(*batch, T)``, the outputs at the root states, where they are known; not for recurrent
-            critics.
-        index: ``(*batch, T)``, for a ``written`` of distinct rows ``(D,)``: which of them each step's is.
-        at_root: the outputs wanted at the root states; all of ``out_keys`` when not given.
-
-    Returns:
-        two lists, of ``(*batch, T, ...)``: at the root states, in the order of ``at_root``, and at the next
-        states, in that of ``out_keys``.
-    """
-    in_keys = [unravel_key(key) for key in critic.in_keys]  # type: ignore[attr-defined]
-    root = data.select(*in_keys, strict=False)
-    following = data.get("next").select(*in_keys, strict=False)
-    outside = ended.clone()
-    outside[..., -1] = True
-    if any((key if isinstance(key, str) else key[-1]) == "is_init" for key in in_keys):
-        first, second = _evaluate_sequences(critic, root, following, outside, in_keys, out_keys)
-        return first if at_root is None else [first[out_keys.index(key)] for key in at_root], second
-
-    # states are independent of each other: one flat batch of the roots, unless they are known, and of next
-    # states that are no root
-    rows = outside.reshape(-1).nonzero().squeeze(-1)
-    steps, shape = outside.numel(), outside.shape
-    root = root.reshape(-1)
-    ends = _complete(following.reshape(-1)[rows], root[rows], in_keys)
-    if written is None:
-        outputs = critic(torch.cat([root, ends]))
-        values = {key: outputs.get(key) for key in out_keys}
-    else:
-        outputs = critic(ends)
-        values = {}
-        for key in out_keys:
-            known, end = written.get(key), outputs.get(key)
-            values[key] = torch.cat([known.reshape(-1, *end.shape[1:]), end])
-    root_rows = torch.arange(steps, device=rows.device) if index is None else index.reshape(-1)
-    next_rows = root_rows.roll(-1)
-    known_rows = len(values[out_keys[0]]) - len(rows)
-    next_rows[rows] = torch.arange(known_rows, known_rows + len(rows), device=rows.device)
-
-    def taken(key: NestedKey, places: Tensor) -> Tensor:
-        return gather(values[key], places.view(shape))
-
-    def whole(key: NestedKey) -> Tensor:
-        return values[key][:steps].reshape(*shape, *values[key].shape[1:])
-
-    wanted = out_keys if at_root is None else at_root
-    first = [whole(key) if index is None else taken(key, root_rows) for key in wanted]
-    return first, [taken(key, next_rows) for key in out_keys]
-
-
-def _evaluate_sequences(
-    critic: Callable[[TensorDictBase], TensorDictBase],
-    root: TensorDictBase,
-    following: TensorDictBase,
-    outside: Tensor,
-    in_keys: list[NestedKey],
-    out_keys: list[NestedKey],
-) -> tuple[list[Tensor], list[Tensor]]:
-    """As :func:`evaluate_rollout`, for recurrent critics: T+1 states in order, and sequences of one state."""
-    time = root.batch_dims - 1
-    end = _complete(following[..., -1:], root[..., -1:], in_keys)
-    with set_recurrent_mode(True):
-        outputs = critic(torch.cat([root, end], time))
-    values = [outputs.get(key) for key in out_keys]
-    at_root = [value.narrow(time, 0, outside.shape[-1]) for value in values]
-    at_next = [value.narrow(time, 1, outside.shape[-1]) for value in values]
-    inside = outside.clone()
-    inside[..., -1] = False
-    if inside.any():
-        with set_recurrent_mode(True):
-            ends = critic(_complete(following[inside], root[inside], in_keys).unsqueeze(-1))
-        for i, key in enumerate(out_keys):
-            at_next[i] = at_next[i].clone()
-            at_next[i][inside] = ends.get(key).squeeze(1)
-    return at_root, at_next
-
-
-def _complete(following: TensorDictBase, root: TensorDictBase, in_keys: list[NestedKey]) -> TensorDictBase:
-    """Next states with every input: what is missing, or NaN (from a compact collector), is the root's."""
-    following = following.copy()
-    for key in in_keys:
-        at_root, at_next = root.get(key, None), following.get(key, None)
-        if at_root is None:
-            continue
-        if (key if isinstance(key, str) else key[-1]) == "is_init":
-            # the step goes on from the root's hidden state, even where the root began an episode
-            following.set(key, torch.zeros_like(at_root))
-        elif at_next is None:
-            following.set(key, at_root)
-        elif at_next.is_floating_point():
-            following.set(key, torch.where(at_next.isnan(), at_root, at_next))
-    return following
 
 
 def _cut_at_padding(done: Tensor, mask: Tensor | None) -> Tensor:
