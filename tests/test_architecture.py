@@ -44,14 +44,7 @@ AROUND = {"sources", "report", "cli"}
 MAX_LINES = 300
 MAX_RECIPE_LINES = 80
 #: All rooms but those around them. 12,000 is the aim; whoever deletes lowers this number.
-MAX_CORE_LINES = 16_500
-#: Files that are still to be split; no other may be added.
-TO_BE_SPLIT = {
-    "vusfa/modules/agents.py",
-    "vusfa/objectives/functional.py",
-    "vusfa/objectives/returns.py",
-    "vusfa/objectives/usf.py",
-}
+MAX_CORE_LINES = 16_400
 
 PRIVATE = re.compile(
     r"\._(?:carrier|cursor|new_unsafe|set_str|step_mdp|module_iter|select_before_return|weight_sync_schemes)\b"
@@ -104,7 +97,7 @@ def test_every_room_is_in_the_table() -> None:
 
 def test_files_can_be_read_at_one_sitting() -> None:
     core = {str(path.relative_to(ROOT)): lines(path) for path in FILES if room(path) not in AROUND}
-    assert {name for name, length in core.items() if length > MAX_LINES} <= TO_BE_SPLIT
+    assert not {name for name, length in core.items() if length > MAX_LINES}
 
 
 def test_recipes_are_thin() -> None:
