@@ -31,6 +31,7 @@ MOVED_MODULES: dict[str, str] = {
     "vusfa.modules.acting": "vusfa.modules.inference",
     "vusfa.modules.pairs": "vusfa.modules.inference",
     "vusfa.modules.presets": "vusfa.modules.config",
+    "vusfa.objectives.single_pass": "vusfa.objectives.networks",
     "vusfa.scenes.faults": "vusfa.scenes.validation",
     "vusfa.training.cells": "vusfa.experiments.measure",
     "vusfa.training.checks": "vusfa.conf.schema",
