@@ -63,12 +63,17 @@ def test_the_published_numbers(
     assert (cfg.collector.num_envs, cfg.collector.rollout, cfg.total_frames) == (num_envs, 5, total_frames)
     optim = cfg.optim
     assert (optim.kind, optim.lr, optim.horizon, optim.max_grad_norm) == (
-        "tf_rmsprop",
+        "a3c_rmsprop",
         7e-4,
         total_frames,
         40.0,
     )
-    assert optim.options == {"alpha": 0.99, "eps": 0.1, "initial_accumulator": 1.0}
+    assert optim.options == {
+        "alpha": 0.99,
+        "eps": 0.1,
+        "initial_accumulator": 1.0,
+        "threads_per_update": None,
+    }
     objective = cfg.objective
     # sums over 5 steps, as means over steps times 5
     assert (objective.objective_coeff, objective.critic_coeff) == (5.0, 1.25)

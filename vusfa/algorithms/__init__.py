@@ -16,7 +16,7 @@ from vusfa.algorithms.registry import (
     register_loss_term,
 )
 from vusfa.algorithms.replay import HindsightReplay, HindsightSampler
-from vusfa.algorithms.schedule import annealed
+from vusfa.algorithms.schedule import annealed, threads_per_step
 from vusfa.algorithms.usf import USF, make_usf_loss
 
 __all__ = [
@@ -35,4 +35,5 @@ __all__ = [
     "make_usf_loss",
     "register_algorithm",
     "register_loss_term",
+    "threads_per_step",
 ]

@@ -13,13 +13,14 @@ algorithm names no collector, file or logger. A new one is a subclass and one li
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
 from tensordict import TensorDictBase
 from torch import Tensor, nn
 
+from vusfa.algorithms.schedule import threads_per_step
 from vusfa.modules import Agent
 from vusfa.scenes import SceneSet
 
@@ -41,7 +42,8 @@ class Algorithm:
     """Losses of an agent, and what belongs to them.
 
     Each update of the trainer is: :meth:`schedule`, collect, :meth:`losses` and one optimizer step,
-    :attr:`replay_steps` times :meth:`replay_losses` and one optimizer step, :meth:`after_step`. A loss is an
+    :attr:`replay_steps` times :meth:`replay_losses` and one optimizer step, :meth:`after_step`; the same for
+    further :meth:`minibatches`, without replay. A loss is an
     entry whose name begins with ``loss_``; these are added up. Other entries are logged.
 
     Args:
@@ -54,6 +56,8 @@ class Algorithm:
 
     Attributes:
         replay_steps: further optimizer steps per batch.
+        threads: environments per optimizer step, each of which counts as one update of the optimizer; None
+            for one update per batch.
     """
 
     #: Class of its settings; Hydra's ConfigStore gets it under the registered name.
@@ -62,6 +66,7 @@ class Algorithm:
 
     def __init__(self, agent: Agent, scenes: SceneSet, settings: Mapping[str, Any]) -> None:
         self.agent, self.scenes, self.settings = agent, scenes, settings
+        self.threads = threads_per_step(settings)
 
     def parameters(self) -> Iterable[nn.Parameter]:
         """Everything that the optimizer moves: the agent's parameters, and those of networks of its own."""
@@ -73,6 +78,13 @@ class Algorithm:
 
     def schedule(self, frames: int) -> None:
         """Sets what depends on the number of frames trained on, such as a coefficient."""
+
+    def minibatches(self, batch: TensorDictBase) -> Sequence[TensorDictBase]:
+        """Parts of a batch, (num_envs, T), each of which gets an optimizer step of its own, in this order.
+
+        The whole batch, but with ``optim=a3c`` groups of as many environments as a step stands for.
+        """
+        return (batch,) if self.threads is None else batch.split(self.threads)
 
     def losses(self, batch: TensorDictBase) -> Mapping[str, Tensor]:
         """Terms of a collector's batch, (num_envs, T); scalars."""

@@ -48,6 +48,11 @@ class Hindsight(USF):
                 "hindsight follows each environment from batch to batch, which collector.kind=multi_async"
                 " hands over in no fixed order; give single or multi_sync, or algorithm=usf"
             )
+        if self.threads is not None:
+            raise ConfigError(
+                "optim.kind=a3c_rmsprop makes an update per environment of a batch, and steps from"
+                " hindsight's replay have none; give optim=adam, or algorithm=usf"
+            )
         self.replay_steps = updates - 1
         sizes = {name: numbers.pop(name) for name in ("capacity", "batch_size", "horizon", "own_future")}
         self.replay = HindsightReplay(scenes.num_states, collector["num_envs"], **sizes)

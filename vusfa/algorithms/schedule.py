@@ -1,8 +1,14 @@
-"""Rates and coefficients that change while the agent learns."""
+"""Rates and coefficients that change while the agent learns, and how many updates one step stands for."""
 
 from __future__ import annotations
 
-__all__ = ["annealed"]
+from collections.abc import Mapping
+from typing import Any
+
+from vusfa.errors import ConfigError
+from vusfa.objectives.a3c import check_threads
+
+__all__ = ["annealed", "threads_per_step"]
 
 
 def annealed(frames: int, start: float, horizon: int | None, end: float = 0.0) -> float:
@@ -18,3 +24,27 @@ def annealed(frames: int, start: float, horizon: int | None, end: float = 0.0) -
     (2.5, 1.0)
     """
     return start if horizon is None else start + (end - start) * min(1.0, frames / horizon)
+
+
+def threads_per_step(settings: Mapping[str, Any]) -> int | None:
+    """Threads whose updates one optimizer step stands for (:class:`~vusfa.objectives.A3CRMSprop`), one per
+    environment; None for any other optimizer, which makes one update with the batch's mean gradient.
+
+    Args:
+        settings: all settings of a training.
+
+    Raises:
+        ConfigError: a number that does not divide the batch's environments.
+
+    >>> optim = {"kind": "a3c_rmsprop", "options": {"threads_per_update": None}}
+    >>> threads_per_step({"optim": optim, "collector": {"kind": "single", "num_envs": 100}})
+    100
+    """
+    optim, collector = settings["optim"], settings["collector"]
+    if optim["kind"] != "a3c_rmsprop":
+        return None
+    workers = collector["num_workers"] if collector["kind"] == "multi_async" else 1
+    try:
+        return check_threads(collector["num_envs"] // workers, optim["options"].get("threads_per_update"))
+    except ValueError as error:
+        raise ConfigError(f"optim.options.{error}") from error

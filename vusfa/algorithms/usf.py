@@ -74,6 +74,8 @@ class USF(Algorithm):
                 f" give algorithm={agent.config['pretrained']}"
             )
         objective = dict(settings["objective"])
+        if self.threads is not None:  # the multiplier moves with each thread's update
+            objective["bottleneck_step_size"] *= self.threads
         coefficients = objective.pop("terms", {})
         self.loss, self.multiplier = make_usf_loss(
             agent.get_policy_operator(out_keys=["action"]),

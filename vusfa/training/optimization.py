@@ -9,11 +9,11 @@ import torch
 from torch import Tensor, nn
 
 from vusfa.errors import ConfigError
-from vusfa.objectives import TFRMSprop
+from vusfa.objectives import A3CRMSprop, TFRMSprop
 
 __all__ = ["OPTIMIZERS", "descend", "make_optimizer", "total_loss"]
 
-OPTIMIZERS = ("adam", "rmsprop", "tf_rmsprop")
+OPTIMIZERS = ("adam", "rmsprop", "tf_rmsprop", "a3c_rmsprop")
 
 
 def total_loss(terms: Mapping[str, Tensor]) -> Tensor:
@@ -54,17 +54,26 @@ def descend(
 
 
 def make_optimizer(
-    params: Iterable[nn.Parameter], kind: str, lr: float, max_grad_norm: float | None = None, **options: Any
+    params: Iterable[nn.Parameter],
+    kind: str,
+    lr: float,
+    max_grad_norm: float | None = None,
+    *,
+    threads: int | None = None,
+    **options: Any,
 ) -> torch.optim.Optimizer:
     """An optimizer by name.
 
     Args:
         params: of the agent.
-        kind: ``"adam"``, ``"rmsprop"`` (torch's) or ``"tf_rmsprop"`` (:class:`~vusfa.objectives.TFRMSprop`).
+        kind: ``"adam"``, ``"rmsprop"`` (torch's), ``"tf_rmsprop"`` (:class:`~vusfa.objectives.TFRMSprop`) or
+            ``"a3c_rmsprop"`` (:class:`~vusfa.objectives.A3CRMSprop`).
         lr: learning rate at the start.
-        max_grad_norm: only ``tf_rmsprop`` clips by itself, every tensor on its own; the others leave it to
-            the caller, who clips all tensors as one.
-        options: further arguments of the optimizer.
+        max_grad_norm: the latter two clip by themselves, every tensor on its own; the others leave it
+            to the caller, who clips all tensors as one.
+        threads: of ``a3c_rmsprop``, see :func:`~vusfa.algorithms.threads_per_step`.
+        options: further arguments of the optimizer; ``threads_per_update``, which ``threads`` has taken into
+            account, is none.
 
     Raises:
         ConfigError: unknown kind or argument.
@@ -72,6 +81,9 @@ def make_optimizer(
     if kind not in OPTIMIZERS:
         raise ConfigError(f"optim.kind is {kind!r}; it must be one of {', '.join(OPTIMIZERS)}")
     try:
+        if kind == "a3c_rmsprop":
+            options.pop("threads_per_update", None)
+            return A3CRMSprop(params, lr=lr, max_grad_norm=max_grad_norm, threads=threads or 1, **options)
         if kind == "tf_rmsprop":
             return TFRMSprop(params, lr=lr, max_grad_norm=max_grad_norm, **options)
         return {"adam": torch.optim.Adam, "rmsprop": torch.optim.RMSprop}[kind](params, lr=lr, **options)

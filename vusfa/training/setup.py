@@ -10,7 +10,7 @@ import torch
 from tensordict.nn import TensorDictModuleBase
 from torchrl.collectors import BaseCollector
 
-from vusfa.algorithms import make_algorithm
+from vusfa.algorithms import make_algorithm, threads_per_step
 from vusfa.envs import SceneObservation, resolve_goals
 from vusfa.errors import ConfigError
 from vusfa.modules import Agent, make_agent
@@ -47,7 +47,12 @@ def make_trainer(
     agent = make_agent(scenes=scenes, **chosen).to(device)
     algorithm = make_algorithm(settings["algorithm"]["name"], agent, scenes, settings)
     optimizer = make_optimizer(
-        algorithm.parameters(), optim["kind"], optim["lr"], optim["max_grad_norm"], **optim["options"]
+        algorithm.parameters(),
+        optim["kind"],
+        optim["lr"],
+        optim["max_grad_norm"],
+        threads=threads_per_step(settings),
+        **optim["options"],
     )
     note = None if settings["resume"] else algorithm.prepare()
     task = {**settings["env"], "goals": goals}

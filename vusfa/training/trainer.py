@@ -146,9 +146,15 @@ class Trainer:
         )
         self.algorithm.schedule(self.frames)
         batch = self.collect(batches)
+        first, *others = self.algorithm.minibatches(batch)
         with self._precision():  # another one: autocast keeps weights that it converted without gradients
-            terms = dict(self.algorithm.losses(batch))
+            terms = dict(self.algorithm.losses(first))
         norm = step(total_loss(terms))
+        for part in others:
+            self.algorithm.after_step()
+            with self._precision():
+                terms = dict(self.algorithm.losses(part))
+            norm = step(total_loss(terms))
         for _ in range(self.algorithm.replay_steps):
             with self._precision():
                 more = self.algorithm.replay_losses()
