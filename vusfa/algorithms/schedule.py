@@ -40,9 +40,10 @@ def threads_per_step(settings: Mapping[str, Any]) -> int | None:
     >>> threads_per_step({"optim": optim, "collector": {"kind": "single", "num_envs": 100}})
     100
     """
-    optim, collector = settings["optim"], settings["collector"]
-    if optim["kind"] != "a3c_rmsprop":
+    optim = settings.get("optim", {})  # an algorithm of one's own may have no settings at all
+    if optim.get("kind") != "a3c_rmsprop":
         return None
+    collector = settings["collector"]
     workers = collector["num_workers"] if collector["kind"] == "multi_async" else 1
     try:
         return check_threads(collector["num_envs"] // workers, optim["options"].get("threads_per_update"))
