@@ -17,6 +17,7 @@ from torch import Tensor
 from benchmarks.peers.bare_env import BareEnv
 from benchmarks.peers.bare_network import BareNetwork, Goals, Outputs, Rows, group
 from vusfa.training import Trainer
+from vusfa.training.precision import resolve_autocast
 
 __all__ = ["BareTraining", "Batch", "Noise", "Targets"]
 
@@ -72,7 +73,7 @@ class BareTraining:
         if self.optim["kind"] != "adam":
             raise ValueError("BareTraining knows optim.kind=adam alone")
         env = cfg["env"]
-        self.net = BareNetwork(trainer.agent, half=cfg["autocast"])
+        self.net = BareNetwork(trainer.agent, half=resolve_autocast(cfg["autocast"], cfg["device"]))
         self.params = list(self.net.params.values())
         self.goal_ids = trainer.goals
         self.slot = torch.zeros(trainer.scenes.num_states, dtype=torch.int64)

@@ -81,3 +81,13 @@ def test_a_walk_in_the_precision_of_the_training(rooms: SceneSet) -> None:
     success = [table.success.double().mean().item() for table in tables]
     assert success[0] == pytest.approx(success[1], abs=0.25)
     assert not tables[0].equal(tables[1])
+
+
+@pytest.mark.parametrize("bfloat16", [True, False])
+def test_auto_is_what_the_machine_is_faster_with(
+    rooms: SceneSet, monkeypatch: pytest.MonkeyPatch, bfloat16: bool
+) -> None:
+    monkeypatch.setattr(measure, "resolve_autocast", lambda setting, device: bfloat16 and setting == "auto")
+    agent = make_agent("vusfa", scenes=rooms, history=2, hidden_size=8, embedding_size=8)
+    with evaluation_precision(agent, {"autocast": "auto"}):
+        assert torch.is_autocast_enabled("cpu") is bfloat16

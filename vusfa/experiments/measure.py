@@ -19,6 +19,7 @@ from vusfa.modules import Agent, InferencePolicy, TabularPolicy
 from vusfa.scenes import SceneSet
 from vusfa.training import load_agent, make_observation
 from vusfa.training.facts import run_facts
+from vusfa.training.precision import resolve_autocast
 from vusfa.training.progress import EvaluationProgress
 
 __all__ = [
@@ -84,15 +85,16 @@ def evaluation_policy(agent: Agent, scenes: SceneSet | None = None) -> TensorDic
 
 
 def evaluation_precision(agent: Agent, config: Mapping[str, Any]) -> AbstractContextManager[Any]:
-    """The context to evaluate in: products in bfloat16 for an agent that was trained with ``autocast=true``
-    and sees several frames, whose every step has to be computed; float32 for any other.
+    """The context to evaluate in: bfloat16 as the agent's training was asked for it, for an agent that sees
+    several frames, whose every step has to be computed; float32 for any other.
 
     Args:
         agent: of the checkpoint.
         config: the checkpoint's settings.
     """
-    on = bool(config["autocast"]) and not agent.is_tabular
-    return torch.autocast(next(agent.parameters()).device.type, torch.bfloat16, enabled=on)
+    device = next(agent.parameters()).device
+    on = resolve_autocast(config["autocast"], device) and not agent.is_tabular
+    return torch.autocast(device.type, torch.bfloat16, enabled=on)
 
 
 def measure_checkpoint(
