@@ -66,7 +66,7 @@ def test_the_job_gets_settings_and_the_command_line(run):
         ("optim.lrr=3", "no setting is called 'optim.lrr'; did you mean 'optim.lr'?"),
         ("optin=sgd", "no setting is called 'optin'; did you mean 'optim'?"),
         ("optim=adamm", "optim=adamm: there is no such choice; did you mean 'adam'?"),
-        ("optim=xyz", "optim=xyz: there is no such choice; there are adam, adam_large_batch, rmsprop"),
+        ("optim=xyz", "optim=xyz: there is no such choice; there are a3c, adam, adam_large_batch, rmsprop"),
         ("seed", "cannot read 'seed'"),
         ("seed=[1", "cannot read 'seed=[1'"),
         ("seed=abc", "seed is 'abc'; it must be a whole number, such as 0"),
