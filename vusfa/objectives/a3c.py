@@ -8,7 +8,7 @@ environments has the mean of these gradients, and one update with the mean moves
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from typing import Any
 
 import torch
@@ -91,24 +91,10 @@ class A3CRMSprop(TFRMSprop):
         for group in self.param_groups:
             group["threads"] = threads
 
-    @torch.no_grad()
-    def step(self, closure: Callable[[], float] | None = None) -> float | None:  # type: ignore[override]
-        """Update the parameters that have a gradient, as ``threads`` updates would.
-
-        Args:
-            closure: re-evaluates the model and returns the loss.
-
-        Returns:
-            what ``closure`` returned, else ``None``.
-        """
-        loss = None
-        if closure is not None:
-            with torch.enable_grad():
-                loss = closure()
-        for group in self.param_groups:
-            for param, grad, accumulator in zip(*self._gather(group), strict=True):
-                _step_of_threads(param, grad, accumulator, group)
-        return loss
+    def _update(self, group: dict[str, Any]) -> None:
+        """As ``threads`` updates would move them."""
+        for param, grad, accumulator in zip(*self._gather(group), strict=True):
+            _step_of_threads(param, grad, accumulator, group)
 
 
 def _step_of_threads(param: Tensor, grad: Tensor, accumulator: Tensor, group: dict[str, Any]) -> None:

@@ -97,21 +97,25 @@ class TFRMSprop(Optimizer):
             with torch.enable_grad():
                 loss = closure()
         for group in self.param_groups:
-            params, grads, accumulators = self._gather(group)
-            if params:
-                # few kernels count on a GPU; a tensor at a time stays in a CPU's cache: twice as fast
-                foreach = all(param.is_cuda for param in params)
-                update = _update_foreach if foreach else _update_one_by_one
-                update(
-                    params,
-                    grads,
-                    accumulators,
-                    group["lr"],
-                    group["alpha"],
-                    group["eps"],
-                    group["max_grad_norm"],
-                )
+            self._update(group)
         return loss
+
+    def _update(self, group: dict[str, Any]) -> None:
+        """Moves the parameters of a group that have a gradient."""
+        params, grads, accumulators = self._gather(group)
+        if params:
+            # few kernels count on a GPU; a tensor at a time stays in a CPU's cache: twice as fast
+            foreach = all(param.is_cuda for param in params)
+            update = _update_foreach if foreach else _update_one_by_one
+            update(
+                params,
+                grads,
+                accumulators,
+                group["lr"],
+                group["alpha"],
+                group["eps"],
+                group["max_grad_norm"],
+            )
 
     def _gather(self, group: dict[str, Any]) -> tuple[list[Tensor], list[Tensor], list[Tensor]]:
         params, grads, accumulators = [], [], []
