@@ -1,0 +1,77 @@
+"""The backbone that made the features of a room, found by what the room's file says of it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+from vusfa.errors import ConfigError
+from vusfa.scenes import SceneSet
+from vusfa.scenes.limits import brief
+from vusfa.sources.backbones import DEFAULT, Backbone, load_backbone
+from vusfa.sources.crops import CROPS
+
+__all__ = ["find_backbone"]
+
+#: Attributes of a scene that must agree with the backbone's own.
+_RECORDED = ("feature_backbone", "feature_layer", "feature_weights_sha256", "feature_preprocessing")
+#: The bundled rooms were written before these attributes existed.
+_OLD = "EfficientNet-lite0 extract_features mean over space; 224x224 bicubic resize"
+
+
+def find_backbone(scenes: SceneSet, backbone: str | Backbone | None = None) -> Backbone:
+    """Load the backbone that the features of these scenes come from, ready for single pictures.
+
+    Args:
+        scenes: whose attributes name it.
+        backbone: the network itself, or its name, where the attributes name none or one whose weights are a
+            file of the user's.
+
+    Raises:
+        ConfigError: the scenes name no backbone, several, one that must be given, or another than is given.
+
+    >>> find_backbone(SceneSet.bundled(["bathroom"])).name
+    'efficientnet-lite0'
+    """
+    recorded = {
+        name: _recorded(scene.attributes) for name, scene in zip(scenes.names, scenes.scenes, strict=True)
+    }
+    first, facts = next(iter(recorded.items()))
+    for name, other in recorded.items():
+        if other != facts:
+            raise ConfigError(
+                f"scenes {first!r} and {name!r} have features of different networks; encode them alike"
+            )
+    known = str(facts.get("feature_backbone", "")) or None
+    if backbone is None:
+        if known is None:
+            raise ConfigError(
+                f"scene {first!r} does not say which backbone made its features; pass it as"
+                " backbone=load_backbone(...), or make them anew with vusfa scenes encode"
+            )
+        if known != DEFAULT:
+            raise ConfigError(
+                f"the features of scene {first!r} are those of {brief(known)}, whose weights are a file of"
+                f" yours; pass backbone=load_backbone({brief(known)}, weights=...)"
+            )
+        crops = facts.get("feature_crops")
+        backbone = load_backbone(DEFAULT, crops=crops if crops in CROPS else None)
+    found = load_backbone(backbone) if isinstance(backbone, str) else backbone
+    own = found.attributes()
+    for key in _RECORDED:
+        if key in facts and facts[key] != own[key]:
+            raise ConfigError(
+                f"scene {first!r} has features of {key.removeprefix('feature_')} {brief(facts[key])}, not"
+                f" {brief(own[key])}; pass the backbone that made them"
+            )
+    if found.preprocessing.crops == "ten":  # agents read the first of the ten, the one in the centre
+        found = replace(found, preprocessing=replace(found.preprocessing, crops="centre"))
+    return found
+
+
+def _recorded(attributes: Mapping[str, Any]) -> dict[str, Any]:
+    facts = {key: attributes[key] for key in (*_RECORDED, "feature_crops") if key in attributes}
+    if not facts and str(attributes.get("feature", "")).startswith(_OLD):
+        facts["feature_backbone"] = DEFAULT
+    return facts

@@ -1,0 +1,128 @@
+"""Pictures as they come, checked and in the shape that the rooms' pictures have."""
+
+from __future__ import annotations
+
+import io
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image, ImageOps, UnidentifiedImageError
+from torch import Tensor
+
+from vusfa.errors import SceneError
+from vusfa.scenes.limits import MAX_PICTURE_SIDE, PICTURE_FORMATS
+
+__all__ = ["MIN_PICTURE_SIDE", "as_picture", "decode_upright", "in_shape"]
+
+#: Pixels of a picture's side; less shows nothing.
+MIN_PICTURE_SIDE = 16
+#: Width over height may differ by this part: rounding, and sensors of 4.03 to 3.
+_SAME_ASPECT = 0.03
+
+
+def decode_upright(encoded: bytes, name: str) -> np.ndarray:
+    """A JPEG or PNG file as (H, W, 3) uint8, turned as its camera says that it was held.
+
+    Args:
+        encoded: the file's content.
+        name: what messages call it.
+
+    Raises:
+        SceneError: it is no such picture, damaged, or larger than allowed.
+
+    >>> decode_upright(b"GIF89a", "goal.gif")
+    Traceback (most recent call last):
+    ...
+    vusfa.errors.SceneError: goal.gif: is no picture that can be read (unknown format); give a JPEG or PNG
+        file
+    """
+    try:
+        with Image.open(io.BytesIO(encoded), formats=PICTURE_FORMATS) as image:
+            if max(image.size) > MAX_PICTURE_SIDE:
+                image.draft("RGB", (MAX_PICTURE_SIDE // 2,) * 2)  # JPEG: decoded at half the size, a quarter
+            if max(image.size) > MAX_PICTURE_SIDE:
+                raise OSError(f"{image.width} x {image.height} pixels; at most {MAX_PICTURE_SIDE} per side")
+            return np.asarray(ImageOps.exif_transpose(image).convert("RGB"))
+    except UnidentifiedImageError:
+        reason = "unknown format"
+    except (
+        OSError,
+        ValueError,
+        SyntaxError,
+        Image.DecompressionBombError,
+        Image.DecompressionBombWarning,
+    ) as error:
+        reason = str(error)
+    raise SceneError(f"{name}: is no picture that can be read ({reason}); give a JPEG or PNG file")
+
+
+def as_picture(picture: Any) -> tuple[np.ndarray, str]:
+    """Any picture as (H, W, 3) uint8, and what messages call it.
+
+    Args:
+        picture: path of a JPEG or PNG file, PIL image, or uint8 (H, W, 3) as array or tensor.
+
+    Raises:
+        SceneError: it is none of these, damaged, or of another type or shape.
+
+    >>> as_picture(np.zeros((40, 50, 3)))
+    Traceback (most recent call last):
+    ...
+    vusfa.errors.SceneError: the picture is float64 of shape (40, 50, 3); give uint8 (H, W, 3), at least 16
+        pixels per side
+    """
+    name = "the picture"
+    if isinstance(picture, str | os.PathLike):
+        name = os.fspath(picture)
+        try:
+            array = decode_upright(Path(picture).read_bytes(), name)
+        except OSError as error:
+            raise SceneError(f"{name}: cannot be read ({error.strerror or error}); check the path") from error
+    elif isinstance(picture, Image.Image):
+        array = np.asarray(picture.convert("RGB"))
+    else:
+        array = picture.cpu().numpy() if isinstance(picture, Tensor) else np.asarray(picture)
+    if (
+        array.dtype != np.uint8
+        or array.ndim != 3
+        or array.shape[2] != 3
+        or min(array.shape[:2]) < MIN_PICTURE_SIDE
+    ):
+        raise SceneError(
+            f"{name} is {array.dtype} of shape {array.shape}; give uint8 (H, W, 3), at least"
+            f" {MIN_PICTURE_SIDE} pixels per side"
+        )
+    return array, name
+
+
+def in_shape(picture: np.ndarray, name: str, height: int, width: int, crop: bool = False) -> np.ndarray:
+    """A picture of the same aspect ratio as the rooms' pictures.
+
+    Args:
+        picture: (H, W, 3) uint8.
+        name: what messages call it.
+        height, width: of the rooms' pictures, pixels.
+        crop: cut the middle out of a picture of another aspect ratio, instead of an error.
+
+    Raises:
+        SceneError: another aspect ratio.
+
+    >>> in_shape(np.zeros((1080, 1920, 3), np.uint8), "goal.jpg", 150, 200, crop=True).shape
+    (1080, 1440, 3)
+    """
+    rows, columns = picture.shape[:2]
+    if abs(columns * height / (rows * width) - 1) <= _SAME_ASPECT:
+        return picture
+    if not crop:
+        raise SceneError(
+            f"{name} is {columns} x {rows} pixels, the rooms' pictures are {width} x {height}; set the camera"
+            " to that aspect ratio, or pass crop (--crop) to cut out the middle"
+        )
+    new_rows, new_columns = (
+        min(rows, round(columns * height / width)),
+        min(columns, round(rows * width / height)),
+    )
+    top, left = (rows - new_rows) // 2, (columns - new_columns) // 2
+    return picture[top : top + new_rows, left : left + new_columns]
