@@ -123,6 +123,36 @@ def scene_file(tmp_path: Path) -> Path:
 
 
 @pytest.fixture
+def checkpoint_state() -> dict[str, Any]:
+    """The smallest content of a checkpoint that is whole."""
+    return {
+        "frames": 7,
+        "updates": 1,
+        "seconds": 0.5,
+        "run_id": "a",
+        "agent_config": {"model": "vusfa"},
+        "agent": {"w": torch.arange(500.0)},
+        "scenes": {"sources": ["kitchen"], "names": ["kitchen"], "fingerprint": "f"},
+        "goals": torch.tensor([1]),
+        "config": {
+            "agent": {"model": "vusfa", "architecture": "controlled"},
+            "algorithm": {"name": "usf"},
+            "env": {},
+            "seed": 0,
+            "threads": 1,
+            "autocast": False,
+            "total_frames": 9,
+        },
+        "overrides": [],
+        "optimizer": {"state": {}, "param_groups": [{}]},
+        "algorithm": {},
+        "collector": {},
+        "meter": {"episodes": {}, "terms": {}},
+        "rng": {},
+    }
+
+
+@pytest.fixture
 def fast_workers() -> Iterator[None]:
     """Workers are forked from a server that has imported everything, instead of importing it each."""
     before = torch.multiprocessing.get_start_method(allow_none=True)

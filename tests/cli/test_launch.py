@@ -130,7 +130,7 @@ def test_compose_is_what_the_command_line_would_be():
 
 
 @pytest.fixture
-def checkpoint(tmp_path: Path, settings_of):
+def checkpoint(tmp_path: Path, settings_of, checkpoint_state: dict[str, Any]):
     """A checkpoint with the settings of a command line, and what is put over them."""
 
     def make(*arguments: str, **more: Any) -> Path:
@@ -138,8 +138,7 @@ def checkpoint(tmp_path: Path, settings_of):
         for name, value in more.pop("config", {}).items():
             OmegaConf.update(config := OmegaConf.create(config), name, value)
             config = OmegaConf.to_container(config)
-        state = {"agent_config": {}, "agent": {}, "goals": torch.tensor([1]), "frames": 5}
-        state |= {"scenes": {"sources": ["kitchen"]}, "config": config, "overrides": list(arguments)}
+        state = {**checkpoint_state, "config": config, "overrides": list(arguments)}
         return save_checkpoint(tmp_path / "my run" / "checkpoint.pt", {**state, **more})
 
     return make

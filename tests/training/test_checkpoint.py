@@ -6,6 +6,7 @@ import random
 import shutil
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -23,32 +24,26 @@ from vusfa.training.upgrade import upgrade_config
 
 DATA = Path(__file__).parent / "data"
 
-STATE = {
-    "agent_config": {},
-    "agent": {"w": torch.arange(500)},
-    "scenes": {},
-    "goals": torch.tensor([1]),
-    "frames": 7,
-}
 
-
-def test_what_is_saved_comes_back(tmp_path: Path):
-    found = load_checkpoint(save_checkpoint(tmp_path / "run" / "a.pt", {**STATE, "rng": random_state()}))
-    assert torch.equal(found["agent"]["w"], STATE["agent"]["w"])
+def test_what_is_saved_comes_back(tmp_path: Path, checkpoint_state: dict[str, Any]):
+    found = load_checkpoint(
+        save_checkpoint(tmp_path / "run" / "a.pt", {**checkpoint_state, "rng": random_state()})
+    )
+    assert torch.equal(found["agent"]["w"], checkpoint_state["agent"]["w"])
     assert found["frames"] == 7
     assert [path.name for path in (tmp_path / "run").iterdir()] == ["a.pt"]
 
 
 @pytest.mark.parametrize("kept", [0.0, 0.3, 0.7, 0.99])
-def test_a_truncated_file_is_named(tmp_path: Path, kept: float):
-    path = save_checkpoint(tmp_path / "a.pt", STATE)
+def test_a_truncated_file_is_named(tmp_path: Path, checkpoint_state: dict[str, Any], kept: float):
+    path = save_checkpoint(tmp_path / "a.pt", checkpoint_state)
     content = path.read_bytes()
     path.write_bytes(content[: int(kept * len(content))])
     with pytest.raises(CheckpointError, match=r"a\.pt: not a whole checkpoint \(\d+ bytes\)"):
         load_checkpoint(path)
 
 
-def test_other_files_are_refused(tmp_path: Path):
+def test_other_files_are_refused(tmp_path: Path, checkpoint_state: dict[str, Any]):
     with pytest.raises(CheckpointError, match="no such checkpoint"):
         load_checkpoint(tmp_path / "none.pt")
     text = tmp_path / "notes.pt"
@@ -61,26 +56,26 @@ def test_other_files_are_refused(tmp_path: Path):
     torch.save([1], tmp_path / "list.pt")
     with pytest.raises(CheckpointError, match="no checkpoint of vusfa"):
         load_checkpoint(tmp_path / "list.pt")
-    torch.save({**STATE, "format": 99}, tmp_path / "new.pt")
+    torch.save({**checkpoint_state, "format": 99}, tmp_path / "new.pt")
     with pytest.raises(CheckpointError, match="format 99"):
         load_checkpoint(tmp_path / "new.pt")
 
 
-def test_no_code_is_run(tmp_path: Path):
+def test_no_code_is_run(tmp_path: Path, checkpoint_state: dict[str, Any]):
     class Trap:
         def __reduce__(self):
             return (Path.touch, (tmp_path / "sprung",))
 
-    torch.save({**STATE, "format": 1, "config": Trap()}, tmp_path / "a.pt")
+    torch.save({**checkpoint_state, "format": 1, "config": Trap()}, tmp_path / "a.pt")
     with pytest.raises(CheckpointError):
         load_checkpoint(tmp_path / "a.pt")
     assert not (tmp_path / "sprung").exists()
 
 
-def test_a_failed_save_keeps_the_old_one(tmp_path: Path):
-    path = save_checkpoint(tmp_path / "a.pt", STATE)
+def test_a_failed_save_keeps_the_old_one(tmp_path: Path, checkpoint_state: dict[str, Any]):
+    path = save_checkpoint(tmp_path / "a.pt", checkpoint_state)
     with pytest.raises(Exception, match="pickle"):
-        save_checkpoint(path, {**STATE, "config": lambda: None})
+        save_checkpoint(path, {**checkpoint_state, "config": lambda: None})
     assert load_checkpoint(path)["frames"] == 7
     assert list(tmp_path.iterdir()) == [path]
 
@@ -95,11 +90,11 @@ def test_scenes_must_be_the_same(make_scene: Callable[..., Scene]):
         check_scenes("a.pt", saved, SceneSet([make_scene("hall", features=9)]))
 
 
-def test_random_states_come_back(tmp_path: Path):
+def test_random_states_come_back(tmp_path: Path, checkpoint_state: dict[str, Any]):
     torch.manual_seed(3)
     np.random.default_rng()
     random.gauss(0, 1)  # leaves a second number in store
-    path = save_checkpoint(tmp_path / "a.pt", {**STATE, "rng": random_state()})
+    path = save_checkpoint(tmp_path / "a.pt", {**checkpoint_state, "rng": random_state()})
     drawn = torch.rand(3).tolist(), np.random.rand(3).tolist(), [random.gauss(0, 1) for _ in range(3)]  # noqa: NPY002
     restore_random_state(load_checkpoint(path)["rng"])
     again = torch.rand(3).tolist(), np.random.rand(3).tolist(), [random.gauss(0, 1) for _ in range(3)]  # noqa: NPY002

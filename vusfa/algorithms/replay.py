@@ -222,6 +222,7 @@ class HindsightReplay:
 
         Raises:
             ConfigError: it is of another number of environments, or longer than the buffer.
+            ValueError: it is not what :meth:`state_dict` gave.
         """
         capacity = self.buffer.storage.max_size
         length = len(state["rows"]["clock"]) if state["rows"] else 0
@@ -231,11 +232,29 @@ class HindsightReplay:
                 f" fit {capacity} of {self.num_envs}; leave hindsight.capacity and collector.num_envs as they"
                 " were"
             )
+        scene_of, num_states = state["sampler"]["scene_of"], len(self.sampler.scene_of)
+        if scene_of.shape != (num_states,) or not bool(
+            (scene_of >= -1).logical_and(scene_of < num_states).all()
+        ):
+            raise ValueError(f"seen states {tuple(scene_of.shape)} where there are {num_states}")
         if length:
-            self.buffer.extend(TensorDict(state["rows"], [length]))
+            rows = state["rows"]
+            _check_rows(rows, length, num_states)
+            self.buffer.extend(TensorDict(rows, [length]))
             writer = state["writer"]
             if isinstance(writer, int):  # of version 0.1: the position alone
                 writer = dict.fromkeys(self.buffer.writer.state_dict(), writer)
             self.buffer.writer.load_state_dict(writer)
         self._clock = state["clock"]
         self.sampler.load_state_dict(state["sampler"])
+
+
+def _check_rows(rows: dict[str, Any], length: int, num_states: int) -> None:
+    """Refuse rows that would be read out of bounds."""
+    shapes = {"scene_id": (length,), "action": (length,), "clock": (length,)}
+    states = rows["state_id"], rows["next"]["state_id"]
+    wrong = [name for name, shape in shapes.items() if rows[name].shape != shape or rows[name].min() < 0]
+    if wrong or any(ids.ndim != 2 or len(ids) != length for ids in states):
+        raise ValueError(f"rows of other shapes: {', '.join(wrong) or 'state_id'}")
+    if any(bool((ids < 0).any() or (ids >= num_states).any()) for ids in states):
+        raise ValueError(f"rows of states that are not among {num_states}")

@@ -27,7 +27,9 @@ says what differs before anything is restored. Files of version 0.1 are converte
 
 from __future__ import annotations
 
+import copy
 import os
+import reprlib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -36,10 +38,11 @@ import torch
 from torch import Tensor
 
 from vusfa.conf.settings import flat
-from vusfa.errors import CheckpointError
+from vusfa.errors import CheckpointError, VusfaError
 from vusfa.files import replacing
 from vusfa.modules import Agent, make_agent
 from vusfa.scenes import SceneSet, bundled_names
+from vusfa.training.content import check_entries, check_like, mended, read_content
 from vusfa.training.upgrade import upgrade
 
 __all__ = [
@@ -62,7 +65,6 @@ FORMAT = 2
 _OF_SCENES = ("scenes", "fingerprint", "num_actions")
 # settings whose other wording changes nothing: scenes are told apart by their content
 _REWORDED = ("resume", "scenes")
-_ENTRIES = ("agent_config", "agent", "scenes", "goals", "frames")
 
 
 def save_checkpoint(path: str | Path, state: Mapping[str, Any]) -> Path:
@@ -73,10 +75,8 @@ def save_checkpoint(path: str | Path, state: Mapping[str, Any]) -> Path:
         state: the entries of this module's table, ``format`` aside.
 
     >>> import tempfile
-    >>> folder = Path(tempfile.mkdtemp())
-    >>> state = {"agent_config": {}, "agent": {}, "scenes": {}, "goals": torch.tensor([1]), "frames": 5}
-    >>> load_checkpoint(save_checkpoint(folder / "a.pt", state))["frames"]
-    5
+    >>> save_checkpoint(Path(tempfile.mkdtemp()) / "run" / "a.pt", {"frames": 5}).name
+    'a.pt'
     """
     with replacing(path) as unfinished:
         torch.save({"format": FORMAT, **state}, unfinished)
@@ -96,25 +96,24 @@ def load_checkpoint(path: str | Path, device: torch.device | str = "cpu") -> dic
     path = Path(path)
     if not os.path.isfile(path):  # Path.is_file raises in a folder that may not be looked into
         raise CheckpointError(f"{path}: no such checkpoint; vusfa train writes RUN/checkpoint.pt")
-    try:
-        state = torch.load(path, map_location=device, weights_only=True)
-    except Exception as error:  # of other files the unpickler raises anything, an IndexError for one
+    state = read_content(path, device)
+    if not isinstance(state, dict) or "agent_config" not in state:
         raise CheckpointError(
-            f"{path}: not a whole checkpoint ({path.stat().st_size} bytes), damaged, cut off in copying or"
-            " another kind of file; take another"
-        ) from error
-    missing = [key for key in _ENTRIES if not isinstance(state, dict) or key not in state]
-    if missing:
-        raise CheckpointError(
-            f"{path}: no checkpoint of vusfa ({missing[0]!r} is missing); give one of vusfa train"
+            f"{path}: no checkpoint of vusfa ('agent_config' is missing); give one of vusfa train"
         )
     if state.get("format") == 1:
-        state = upgrade(state)
+        try:
+            state = upgrade(state)
+        except CheckpointError as error:
+            raise CheckpointError(f"{path}: {error}") from error
+        except (KeyError, TypeError, AttributeError, ValueError) as error:
+            raise mended(path, f"of version 0.1, but not as that wrote it ({error!r})") from error
     if state.get("format") != FORMAT:
         raise CheckpointError(
-            f"{path}: checkpoint of format {state.get('format')}, this version reads 1 and {FORMAT};"
-            " use the version that wrote it"
+            f"{path}: checkpoint of format {reprlib.repr(state.get('format'))}, this version reads 1 and"
+            f" {FORMAT}; use the version that wrote it"
         )
+    check_entries(path, state)
     return state
 
 
@@ -219,7 +218,12 @@ def load_agent(
     state = load_checkpoint(path, device)
     scenes = (SceneSet.open(state["scenes"]["sources"]) if scenes is None else scenes).to(device)
     check_scenes(path, state["scenes"], scenes)
-    agent = rebuild_agent(state["agent_config"], scenes).to(device)
+    try:
+        agent = rebuild_agent(state["agent_config"], scenes).to(device)
+    except VusfaError as error:
+        raise CheckpointError(f"{path}: {error}") from error
+    except (TypeError, ValueError, KeyError, AttributeError, IndexError, RuntimeError) as error:
+        raise mended(path, f"no agent can be made of its entry 'agent_config' ({error})") from error
     load_weights(agent, state, path)
     return agent.eval(), scenes, state
 
@@ -231,22 +235,46 @@ def load_weights(agent: Agent, state: Mapping[str, Any], path: str | Path) -> No
         CheckpointError: they are of another model.
     """
     try:
-        agent.load_state_dict(state["agent"])
-    except RuntimeError as error:
-        first = str(error).splitlines()[-1].strip()
-        raise CheckpointError(
-            f"{path}: its weights do not fit a {agent.config['model']} agent ({first})"
-        ) from error
+        check_like(path, "agent", state["agent"], agent.state_dict())
+    except CheckpointError as error:
+        raise CheckpointError(f"{error} (it was read as a {agent.config['model']} agent)") from error
+    agent.load_state_dict(state["agent"])
 
 
 def load_optimizer(optimizer: torch.optim.Optimizer, state: Mapping[str, Any], path: str | Path) -> None:
-    """The optimizer's memory of gradients; its numbers stay as they are."""
+    """The optimizer's memory of gradients; its numbers stay as they are.
+
+    Raises:
+        CheckpointError: it is another optimizer's, or not of these parameters' shapes.
+    """
     saved, settings = state["optimizer"], [dict(group) for group in optimizer.param_groups]
-    if saved["param_groups"][0].keys() != settings[0].keys():
+    groups = saved["param_groups"]
+    if len(groups) != len(settings) or not all(isinstance(group, dict) for group in groups):
+        raise mended(path, f"its entry 'optimizer.param_groups' has not {len(settings)} groups")
+    if groups[0].keys() != settings[0].keys():
         raise CheckpointError(
             f"{path}: its optimizer is not a {type(optimizer).__name__}; leave the setting out,"
             " or start a new run"
         )
+    expected = _stepped(optimizer)
+    for index, group in enumerate(expected["param_groups"]):
+        if groups[index]["params"] != group["params"]:
+            raise mended(path, f"its entry 'optimizer.param_groups.{index}.params' is of other parameters")
+    for index, moments in saved["state"].items():  # a parameter without a gradient has none
+        if index not in expected["state"]:
+            raise mended(path, f"its entry 'optimizer.state.{reprlib.repr(index)}' is of no parameter")
+        check_like(path, f"optimizer.state.{index}", moments, expected["state"][index])
     optimizer.load_state_dict(saved)
     for group, numbers in zip(optimizer.param_groups, settings, strict=True):
         group.update({key: value for key, value in numbers.items() if key != "params"})
+
+
+def _stepped(optimizer: torch.optim.Optimizer) -> dict[str, Any]:
+    """State of a copy of an optimizer after a step: the shapes that a saved one must have. A fused optimizer
+    reads past the end of a shorter tensor."""
+    probe = copy.deepcopy(optimizer)
+    for group in probe.param_groups:
+        for param in group["params"]:
+            param.grad = torch.zeros_like(param)
+    probe.step()
+    return probe.state_dict()

@@ -12,9 +12,11 @@ Rows get the same goals however they are spread over processes.
 
 from __future__ import annotations
 
+import reprlib
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -27,6 +29,7 @@ from vusfa.envs import TargetNavEnv
 from vusfa.errors import CheckpointError, ConfigError
 from vusfa.scenes import SceneSet
 from vusfa.torchrl_private import carrier, end_weight_sharing, put_carrier
+from vusfa.training.content import check_like, mended, restore
 from vusfa.training.signals import ignore_interrupts
 
 __all__ = [
@@ -215,22 +218,41 @@ def collector_state(collector: BaseCollector) -> dict[str, Any]:
     }
 
 
-def load_collector_state(collector: BaseCollector, state: dict[str, Any]) -> None:
+def load_collector_state(
+    collector: BaseCollector, state: dict[str, Any], path: str | Path = "the checkpoint"
+) -> None:
     """Restore what :func:`collector_state` gave; nothing for a collector with workers.
 
+    Args:
+        collector: begun, or new.
+        state: of a collector of the same kind and settings.
+        path: of the checkpoint, for messages.
+
     Raises:
-        CheckpointError: the state is of environments in another number.
+        CheckpointError: the state is of environments in another number, or damaged.
     """
     if not isinstance(collector, Collector) or not state:
         return
-    batch_size = list(carrier(collector).batch_size)
-    if state["batch_size"] != batch_size:
+    own = collector_state(collector)
+    if not isinstance(state.get("carrier"), dict):
+        raise mended(path, "its entry 'collector.carrier' is missing")
+    if state.get("batch_size") != own["batch_size"]:
         raise CheckpointError(
-            f"the checkpoint holds {state['batch_size']} environments, the collector {batch_size};"
-            " leave collector.num_envs as it was"
+            f"the checkpoint holds {reprlib.repr(state.get('batch_size'))} environments, the collector"
+            f" {own['batch_size']}; leave collector.num_envs as it was"
         )
-    collector.env.load_state_dict(state["env"])
-    _base(collector.env).set_rng_state(state["generator"])
+    known = own["carrier"]  # a collector that has not begun has no action there yet
+    begun = {
+        **state,
+        "carrier": {**known, **{k: v for k, v in state.get("carrier", {}).items() if k in known}},
+    }
+    check_like(path, "collector", begun, own)
+    for name, value in state["carrier"].items():
+        spec = collector.env.observation_spec.get(name, None)
+        if spec is not None and not value.is_floating_point() and not spec.is_in(value):
+            raise mended(path, f"its entry 'collector.carrier.{name}' is out of range")
+    restore(path, "collector.env", collector.env.load_state_dict, state["env"])
+    restore(path, "collector.generator", _base(collector.env).set_rng_state, state["generator"])
     put_carrier(collector, state["carrier"])
 
 

@@ -140,8 +140,16 @@ class MeanMeter:
         return {"names": self._names, "sum": self._sum, "count": self._count}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Go on from what :meth:`state_dict` gave."""
-        self._names, self._sum, self._count = list(state["names"]), state["sum"], state["count"]
+        """Go on from what :meth:`state_dict` gave.
+
+        Raises:
+            ValueError: it is none.
+        """
+        names, total, count = list(state["names"]), state["sum"], state["count"]
+        fits = total is None or (isinstance(total, Tensor) and total.shape == (len(names),))
+        if not fits or type(count) is not int or not all(isinstance(name, str) for name in names):
+            raise ValueError(f"{len(names)} names, {count} updates and sums that do not fit them")
+        self._names, self._sum, self._count = names, total, count
 
 
 def _rates(sums: Sequence[float]) -> dict[str, float]:

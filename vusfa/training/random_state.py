@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import torch
 
-__all__ = ["random_state", "restore_random_state"]
+__all__ = ["check_random_state", "random_state", "restore_random_state"]
 
 
 def random_state() -> dict[str, Any]:
@@ -45,4 +45,15 @@ def restore_random_state(state: Mapping[str, Any]) -> None:
     version, internal, gauss = state["python"]
     random.setstate((version, tuple(internal), gauss))
     name, keys, position, has_gauss, cached = state["numpy"]
+    if keys.shape != (624,) or not 0 <= position <= 624:  # numpy does not look
+        raise ValueError(f"a state of numpy's generator at {position} of {tuple(keys.shape)}")
     np.random.set_state((name, keys.cpu().numpy().astype(np.uint32), position, has_gauss, cached))  # noqa: NPY002
+
+
+def check_random_state(state: Mapping[str, Any]) -> None:
+    """Raise what :func:`restore_random_state` would raise; the generators stay as they are."""
+    before = random_state()
+    try:
+        restore_random_state(state)
+    finally:
+        restore_random_state(before)

@@ -22,7 +22,7 @@ from torchrl.collectors import BaseCollector, Collector
 
 from vusfa.algorithms import Algorithm, annealed
 from vusfa.envs import SceneObservation
-from vusfa.errors import CheckpointError, VusfaError
+from vusfa.errors import VusfaError
 from vusfa.modules import Agent, InferencePolicy
 from vusfa.scenes import SceneSet
 from vusfa.training.checkpoint import (
@@ -35,12 +35,13 @@ from vusfa.training.checkpoint import (
     scene_sources,
 )
 from vusfa.training.collectors import collector_state, load_collector_state, opened
+from vusfa.training.content import check_like, restore
 from vusfa.training.loggers import Logger
 from vusfa.training.metrics import EpisodeMeter, MeanMeter
 from vusfa.training.optimization import descend, total_loss
 from vusfa.training.precision import resolve_autocast
 from vusfa.training.progress import ProgressLine
-from vusfa.training.random_state import random_state, restore_random_state
+from vusfa.training.random_state import check_random_state, random_state, restore_random_state
 from vusfa.training.signals import StopOnSignal
 
 __all__ = ["Trainer"]
@@ -97,7 +98,7 @@ class Trainer:
         self.run_id = secrets.token_hex(4)
         self.episodes, self.terms = EpisodeMeter(scenes, goals), MeanMeter()
         self._collector: BaseCollector | None = None
-        self._waiting: Mapping[str, Any] | None = None  # of a checkpoint: what a collector must be there for
+        self._waiting: tuple[str | Path, Mapping[str, Any]] | None = None  # a checkpoint, for the collector
 
     @contextmanager
     def collecting(self) -> Iterator[Iterator[TensorDictBase]]:
@@ -107,8 +108,9 @@ class Trainer:
             self._collector = collector
             try:
                 if self._waiting is not None:
-                    load_collector_state(collector, self._waiting["collector"])
-                    restore_random_state(self._waiting["rng"])  # last: what came before has drawn
+                    path, state = self._waiting
+                    load_collector_state(collector, state["collector"], path)
+                    restore_random_state(state["rng"])  # last: what came before has drawn
                     self._waiting = None
                 yield iter(collector)
             finally:
@@ -270,15 +272,14 @@ class Trainer:
         check_fits(path, state, self.scenes, self.goals, self.agent)
         load_weights(self.agent, state, path)
         load_optimizer(self.optimizer, state, path)
-        try:
-            self.algorithm.load_state_dict(state["algorithm"])
-        except CheckpointError as error:
-            raise CheckpointError(f"{path}: {error}") from error
+        restore(path, "algorithm", self.algorithm.load_state_dict, state["algorithm"])
+        check_like(path, "meter.episodes", state["meter"]["episodes"], self.episodes.state_dict())
         self.episodes.load_state_dict(state["meter"]["episodes"])
-        self.terms.load_state_dict(state["meter"]["terms"])
+        restore(path, "meter.terms", self.terms.load_state_dict, state["meter"]["terms"])
+        restore(path, "rng", check_random_state, state["rng"])
         for name in ("frames", "updates", "seconds", "run_id"):
             setattr(self, name, state[name])
-        self._waiting = state
+        self._waiting = path, state
         return differences(state["config"], self.settings)
 
     def _precision(self) -> AbstractContextManager:
