@@ -220,7 +220,15 @@ def restore(path: str | Path, where: str, load: Callable[[Any], object], state: 
         load(state)
     except VusfaError as error:
         raise CheckpointError(f"{path}: {error}") from error
-    except (KeyError, TypeError, ValueError, RuntimeError, IndexError, AttributeError) as error:
+    except (
+        KeyError,
+        TypeError,
+        ValueError,
+        RuntimeError,
+        IndexError,
+        AttributeError,
+        OverflowError,
+    ) as error:
         raise mended(path, f"its entry {where!r} cannot be restored ({reprlib.repr(str(error))})") from error
 
 
