@@ -11,13 +11,10 @@ import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
-from zipfile import BadZipFile
 
-import numpy as np
+from vusfa.errors import ConfigError
 
-from vusfa.errors import ConfigError, ResultError
-
-__all__ = ["check_folder", "read_npz", "replacing", "write_csv", "write_json"]
+__all__ = ["check_folder", "replacing", "write_csv", "write_json"]
 
 
 def check_folder(path: str | Path, setting: str) -> Path:
@@ -82,19 +79,6 @@ def write_csv(
     for row in rows:
         writer.writerow({key: "" if _is_nan(value) else value for key, value in row.items()})
     return _write(path, text.getvalue())
-
-
-def read_npz(path: str | Path) -> dict[str, np.ndarray]:
-    """The arrays of a .npz file, without pickles.
-
-    Raises:
-        ResultError: the file is missing or damaged.
-    """
-    try:
-        with open(path, "rb") as file, np.load(file, allow_pickle=False) as content:
-            return {name: content[name] for name in content.files}
-    except (OSError, ValueError, EOFError, BadZipFile) as error:
-        raise ResultError(f"{path}: cannot be read ({error!r}); make it again") from error
 
 
 def write_json(path: str | Path, content: Any) -> Path:

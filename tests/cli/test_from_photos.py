@@ -196,7 +196,7 @@ def test_edges_and_what_may_be_an_oversight(run: Run, flat: Path, tmp_path: Path
         (["flat", "--size", "0x10"], "--size is '0x10'"),
         (["flat", "--turn", "30"], "a turn is 30 degrees; it must be one of 45, 90, 180, 360"),
         (["flat", "--step", "0.3"], "the nearest place of a grid of 0.3 m"),
-        (["flat", "--poses", "gone.csv"], "gone.csv: there is no such file"),
+        (["flat", "--poses", "gone.csv"], "gone.csv: cannot be read (there is no such file)"),
         (["flat", "--features", "gone.npy"], "gone.npy: cannot be read"),
         (["flat", "--backbone", "magic"], "no backbone is called 'magic'"),
     ],

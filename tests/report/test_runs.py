@@ -70,12 +70,12 @@ def test_curves_with_gaps(tmp_path: Path):
 @pytest.mark.parametrize(
     ("name", "text", "message"),
     [
-        ("config.json", "{", "config.json cannot be read"),
-        ("config.json", "[]", "holds no settings"),
+        ("config.json", "{", "config.json: cannot be read"),
+        ("config.json", "[]", "holds \\[\\] in place of an object"),
         ("config.json", "{}", "field 'agent.model' is missing"),
-        ("metrics.csv", "frames\nmany\n", "metrics.csv: could not convert string to float: 'many'"),
+        ("metrics.csv", "frames\nmany\n", "line 2 .could not convert string to float: .many."),
         ("evaluation_episodes.csv", "scene,goal\nhall,1\n", "column 'start' is missing"),
-        ("evaluation_episodes.csv", "scene,goal\n", "it has no episodes"),
+        ("evaluation_episodes.csv", "scene,goal\n", "column .start. is missing"),
     ],
 )
 def test_damaged_files_are_named(run_folders: list[Path], tmp_path: Path, name: str, text: str, message: str):

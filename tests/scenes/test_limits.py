@@ -125,7 +125,7 @@ def test_pictures_that_are_refused(make_file: Make, encoded: bytes, message: str
         dataset = file.create_dataset("observation_jpeg", (5,), h5py.vlen_dtype(np.uint8))
         for state in range(5):
             dataset[state] = np.frombuffer(encoded, np.uint8)
-    assert "dataset 'observation_jpeg', state 0: is no picture" in fault(path)
+    assert "dataset 'observation_jpeg', state 0: is unusable" in fault(path)
 
 
 def test_only_regular_files_are_opened(tmp_path: Path) -> None:
@@ -162,5 +162,5 @@ def test_chunks_are_bounded(make_file: Make, pictures: np.ndarray, monkeypatch: 
     with h5py.File(path, "a") as file:
         file.create_dataset("observation", data=pictures, chunks=pictures.shape)
     assert validate(path) == []
-    monkeypatch.setattr("vusfa.scenes.limits.MAX_CHUNK_BYTES", 700)
+    monkeypatch.setattr("vusfa.limits.MAX_CHUNK_BYTES", 700)
     assert "has chunks of shape (5, 6, 8, 3); at most 700 bytes" in fault(path)

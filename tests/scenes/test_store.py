@@ -384,13 +384,13 @@ def test_a_group_in_a_datasets_place(make_file: Callable[..., Path]) -> None:
 def test_pictures_that_are_none(make_file: Callable[..., Path], pictures: np.ndarray) -> None:
     good = [jpeg(picture) for picture in pictures]
     first = with_jpegs(make_file("first.h5"), [b"none", *good[1:]])
-    assert the_fault(first).startswith("dataset 'observation_jpeg', state 0: is no picture (unknown format)")
+    assert the_fault(first).startswith("dataset 'observation_jpeg', state 0: is unusable (unknown format)")
     few = with_jpegs(make_file("few.h5"), good[:3])
     assert the_fault(few).startswith("dataset 'observation_jpeg' has 3 pictures, but the graph has 5 states")
     # Loading looks at the first picture alone; validation at every one, and so does whoever asks for it.
     for name, bad, words in (
-        ("cut.h5", good[3][:-30], "state 3: is no picture (image file is truncated"),
-        ("small.h5", jpeg(pictures[3][:2]), "state 3: is (2, 8) in size, state 0 is (6, 8)"),
+        ("cut.h5", good[3][:-30], "state 3: is unusable (image file is truncated"),
+        ("small.h5", jpeg(pictures[3][:2]), "state 3: is unusable ((2, 8) in size, and state 0 is (6, 8)"),
     ):
         path = with_jpegs(make_file(name), [*good[:3], bad, good[4]])
         assert len(validate(path)) == 1
@@ -407,8 +407,8 @@ def test_pictures_of_other_sizes_in_later_blocks(
     monkeypatch.setattr(store.picture_files, "_AT_ONCE", 2)
     path = with_jpegs(make_file(), [jpeg(p) for p in pictures[:2]] + [jpeg(p[:3]) for p in pictures[2:]])
     assert validate(path) == [
-        f"{path}: dataset 'observation_jpeg', state 2: is (3, 8) in size, state 0 is (6, 8);"
-        " write all in one size"
+        f"{path}: dataset 'observation_jpeg', state 2: is unusable ((3, 8) in size, and state 0 is (6, 8));"
+        " write it again"
     ]
 
 

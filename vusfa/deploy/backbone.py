@@ -7,8 +7,8 @@ from dataclasses import replace
 from typing import Any
 
 from vusfa.errors import ConfigError
+from vusfa.limits import brief
 from vusfa.scenes import SceneSet
-from vusfa.scenes.limits import brief
 from vusfa.sources.backbones import DEFAULT, Backbone, load_backbone
 from vusfa.sources.crops import CROPS
 

@@ -12,7 +12,7 @@ from PIL import Image, ImageOps, UnidentifiedImageError
 from torch import Tensor
 
 from vusfa.errors import SceneError
-from vusfa.scenes.limits import MAX_PICTURE_SIDE, PICTURE_FORMATS
+from vusfa.limits import MAX_PICTURE_SIDE, PICTURE_FORMATS
 
 __all__ = ["MIN_PICTURE_SIDE", "as_picture", "decode_upright", "in_shape"]
 

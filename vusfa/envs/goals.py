@@ -23,13 +23,13 @@ from typing import Any
 
 import numpy as np
 import torch
-import yaml
 from torch import Tensor
 
 from vusfa.errors import GoalError
+from vusfa.limits import brief
+from vusfa.reading import read_yaml
 from vusfa.scenes import Scene, SceneSet
 from vusfa.scenes.graph import strong_components
-from vusfa.scenes.limits import brief, read_text
 
 __all__ = ["PAPER_MANIFEST", "GoalSpec", "read_manifest", "resolve_goals", "spread_goals"]
 
@@ -94,13 +94,7 @@ def read_manifest(path: str | PathLike[str]) -> dict[str, list[int]]:
     >>> read_manifest(PAPER_MANIFEST)["bathroom_02"]
     [26, 37, 43, 53, 69]
     """
-    path = Path(path)
-    try:
-        content = yaml.safe_load(read_text(path))
-    except (OSError, UnicodeDecodeError) as error:
-        raise GoalError(f"{path}: cannot be read ({error}); goals come from a YAML manifest") from error
-    except (yaml.YAMLError, RecursionError) as error:
-        raise GoalError(f"{path}: is not YAML ({error}); write lines like 'bathroom: [26, 37]'") from error
+    content = read_yaml(path, GoalError, "write lines like 'bathroom: [26, 37]'")
     if not isinstance(content, dict) or not content:
         raise GoalError(f"{path}: holds no scenes; write lines like 'bathroom: [26, 37]'")
     for name, ids in content.items():

@@ -17,12 +17,22 @@ from torch import Tensor
 from vusfa.envs.goals import resolve_goals
 from vusfa.errors import ResultError
 from vusfa.evaluation.starts import episode_starts
-from vusfa.files import read_npz, replacing
+from vusfa.files import replacing
+from vusfa.reading import read_npz
 from vusfa.scenes import SceneSet
 
 __all__ = ["BUNDLED_MANIFEST", "Manifest", "make_manifest", "read_manifest", "write_manifest"]
 
 BUNDLED_MANIFEST = Path(__file__).parent / "manifests" / "bundled.npz"
+
+#: The columns of a manifest: kinds of dtype, and dimensions.
+_COLUMNS = {
+    "start": ("iu", 1),
+    "goal": ("iu", 1),
+    "validation": ("b", 1),
+    "seed": ("iu", 0),
+    "fingerprint": ("U", 0),
+}
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,9 +127,16 @@ def read_manifest(path: str | Path = BUNDLED_MANIFEST) -> Manifest:
     (16920, 200)
     """
     content = read_npz(path)
-    missing = {"start", "goal", "validation", "seed", "fingerprint"} - content.keys()
-    if missing:
-        raise ResultError(f"{path}: {sorted(missing)[0]!r} is missing; it is no manifest of episodes")
-    start, goal = (torch.from_numpy(content[name]).to(torch.int64) for name in ("start", "goal"))
-    validation = torch.from_numpy(content["validation"])
+    for name, (kinds, dims) in _COLUMNS.items():
+        column = content.get(name)
+        if column is None or column.dtype.kind not in kinds or column.ndim != dims:
+            held = "missing" if column is None else f"{column.dtype} of shape {column.shape}"
+            raise ResultError(f"{path}: {name!r} is {held}; it is no manifest of episodes")
+    start, goal, validation = (torch.from_numpy(content[name]) for name in ("start", "goal", "validation"))
+    if not len(start) == len(goal) == len(validation):
+        raise ResultError(
+            f"{path}: 'start', 'goal' and 'validation' have {len(start)}, {len(goal)} and {len(validation)}"
+            f" entries; it is no manifest of episodes"
+        )
+    start, goal = start.to(torch.int64), goal.to(torch.int64)
     return Manifest(start, goal, validation, int(content["seed"]), str(content["fingerprint"]))

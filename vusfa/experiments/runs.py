@@ -11,7 +11,6 @@ The folder appears at once and complete, or not at all.
 
 from __future__ import annotations
 
-import json
 import shutil
 import tempfile
 from collections.abc import Mapping, Sequence
@@ -29,11 +28,14 @@ from vusfa.errors import ResultError
 from vusfa.evaluation.episodes import Episodes
 from vusfa.evaluation.exact import ExactGoals
 from vusfa.evaluation.long_table import episode_rows, exact_rows, join_tables, row_label
-from vusfa.files import read_npz, write_json
+from vusfa.files import write_json
+from vusfa.limits import brief
+from vusfa.reading import read_json, read_npz
 
 __all__ = ["Run", "read_run", "read_runs", "write_run"]
 
 _EXACT = "exact"
+_AGAIN = "delete the folder and run it again"
 _EPISODES = ("scene", "goal", "start", "success", "length", "shortest", "collisions", "trained")
 
 
@@ -94,8 +96,7 @@ def write_run(root: str | Path, run: Run) -> Path:
     {'model': 'random walk'}
     """
     for name in run.episodes:
-        if name == _EXACT or not name.replace("-", "_").isidentifier():
-            raise ResultError(f"episodes are called {name!r}; give a name of letters, digits and -")
+        _check_mode(name, root)
     folder = Path(root) / run.experiment / run.name
     folder.parent.mkdir(parents=True, exist_ok=True)
     unfinished = Path(tempfile.mkdtemp(prefix=f".{run.name}.", dir=folder.parent))
@@ -121,6 +122,11 @@ def write_run(root: str | Path, run: Run) -> Path:
     return folder
 
 
+def _check_mode(name: Any, path: str | Path) -> None:
+    if not isinstance(name, str) or name == _EXACT or not name.replace("-", "_").isidentifier():
+        raise ResultError(f"{path}: episodes are called {brief(name)}; give a name of letters, digits and -")
+
+
 def read_run(root: str | Path, experiment: str, name: str) -> Run:
     """Read a run's folder.
 
@@ -129,17 +135,19 @@ def read_run(root: str | Path, experiment: str, name: str) -> Run:
     """
     folder = Path(root) / experiment / name
     path = folder / "cell.json"
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-        info, modes = content["info"], content.get("episodes", [])
-        scenes, steps = tuple(content.get("scenes", ())), int(content.get("max_steps", 0))
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise ResultError(
-            f"{path}: cannot be read ({error!r}); delete the folder and run it again"
-        ) from error
+    content = read_json(path, ResultError, _AGAIN)
+    content = {"episodes": [], "scenes": [], "max_steps": 0, **content}
+    for key, kind in {"info": dict, "episodes": list, "scenes": list, "max_steps": int}.items():
+        if not isinstance(content.get(key), kind):
+            raise ResultError(f"{path}: {key!r} is {brief(content.get(key))}; {_AGAIN}")
+    info, modes, steps = content["info"], content["episodes"], content["max_steps"]
+    for mode in modes:
+        _check_mode(mode, path)
     episodes = {
         mode: Episodes(
-            **_read_columns(folder / f"{mode}.npz", _EPISODES), scene_names=scenes, max_steps=steps
+            **_read_columns(folder / f"{mode}.npz", _EPISODES),
+            scene_names=tuple(content["scenes"]),
+            max_steps=steps,
         )
         for mode in modes
     }
@@ -183,7 +191,12 @@ def _read_columns(path: Path, required: Sequence[str]) -> dict[str, Tensor]:
     content = read_npz(path)
     missing = [name for name in required if name not in content]
     if missing:
-        raise ResultError(f"{path}: the column {missing[0]!r} is missing; run it again")
+        raise ResultError(f"{path}: the column {missing[0]!r} is missing; {_AGAIN}")
+    for name, column in content.items():
+        if column.dtype.kind not in "biuf" or column.shape != (content[required[0]].size,):
+            raise ResultError(
+                f"{path}: the column {name!r} is {column.dtype} of shape {column.shape}; {_AGAIN}"
+            )
     types = {"b": torch.bool, "f": torch.float64}
     return {
         name: torch.from_numpy(np.ascontiguousarray(column)).to(types.get(column.dtype.kind, torch.int64))

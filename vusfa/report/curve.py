@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import csv
 from pathlib import Path
 
 import numpy as np
 
 from vusfa.errors import ConfigError
 from vusfa.files import replacing
+from vusfa.reading import read_csv
 
 __all__ = ["plot_curve", "read_metrics"]
 
@@ -19,17 +19,8 @@ def read_metrics(path: str | Path) -> dict[str, np.ndarray]:
     Raises:
         ConfigError: there is no such file, or a field is no number.
     """
-    path = Path(path)
-    if not path.is_file():
-        raise ConfigError(f"{path}: no such file; a run writes metrics.csv in its folder")
-    with open(path, newline="", encoding="utf-8") as file:
-        rows = list(csv.DictReader(file))
-    try:
-        return {
-            name: np.array([float(row[name] or "nan") for row in rows]) for name in (rows[0] if rows else ())
-        }
-    except (TypeError, ValueError) as error:
-        raise ConfigError(f"{path}: {error}; it is to hold numbers alone, see docs/training.md") from error
+    columns = read_csv(path, ConfigError, "a run writes metrics.csv in its folder, see docs/training.md")
+    return {name: column for name, column in columns.items() if len(column)}
 
 
 def plot_curve(

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -19,12 +17,14 @@ from vusfa.errors import ConfigError
 from vusfa.evaluation import Episodes
 from vusfa.evaluation.exact import ExactGoals
 from vusfa.evaluation.long_table import WITHIN, episode_rows, exact_rows, join_tables, row_label
+from vusfa.reading import read_csv, read_json
 from vusfa.report.curve import read_metrics
 from vusfa.training import row_name
 
 __all__ = ["LoggedRun", "read_episodes", "read_run", "run_label", "split_name"]
 
 _EVALUATIONS = ("zero_shot", "evaluation")
+_AGAIN = "evaluate the run again with recipes/zero_shot.py"
 _COLUMNS = ("goal", "start", "success", "length", "shortest", "collisions", "trained")
 
 
@@ -117,7 +117,7 @@ def read_run(source: str | Path) -> LoggedRun:
     label, folder = split_name(source)
     if not folder.is_dir():
         raise ConfigError(f"{folder} is not a folder; give the folder of a run of recipes/train.py")
-    settings = _read_json(folder / "config.json")
+    settings = read_json(folder / "config.json", ConfigError, "give the folder of a run of recipes/train.py")
     if not isinstance(settings.get("agent"), Mapping) or "model" not in settings["agent"]:
         raise ConfigError(
             f"{folder / 'config.json'}: field 'agent.model' is missing; it is no run's settings"
@@ -158,22 +158,23 @@ def read_episodes(path: Path, max_steps: int) -> Episodes:
     Raises:
         ConfigError: a column is missing, or holds something else than whole numbers.
     """
-    with open(path, newline="", encoding="utf-8") as file:
-        rows = list(csv.DictReader(file))
-    missing = [name for name in ("scene", *_COLUMNS) if rows and name not in rows[0]]
-    if missing or not rows:
+    content = read_csv(path, ConfigError, _AGAIN, words=["scene"])
+    missing = [name for name in ("scene", *_COLUMNS) if name not in content]
+    if missing or not content["scene"]:
         lacks = f"column {missing[0]!r} is missing" if missing else "it has no episodes"
-        raise ConfigError(f"{path}: {lacks}; evaluate the run again with recipes/zero_shot.py")
-    names = tuple(dict.fromkeys(row["scene"] for row in rows))
+        raise ConfigError(f"{path}: {lacks}; {_AGAIN}")
+    names = tuple(dict.fromkeys(content["scene"]))
     index = {name: place for place, name in enumerate(names)}
-    names_there = [*_COLUMNS, *(["remaining"] if "remaining" in rows[0] else [])]
-    try:
-        columns = {name: torch.tensor([int(row[name]) for row in rows]) for name in names_there}
-    except (TypeError, ValueError) as error:
-        raise ConfigError(f"{path}: {error}; evaluate the run again with recipes/zero_shot.py") from error
-    for name in ("success", "trained"):
-        columns[name] = columns[name].to(torch.bool)
-    scene = torch.tensor([index[row["scene"]] for row in rows])
+    columns = {}
+    for name in [*_COLUMNS, *({"remaining"} & content.keys())]:
+        whole = np.abs(content[name]) < 2**53
+        whole &= content[name] == np.floor(content[name])
+        if not whole.all():
+            wrong = content[name][~whole][0]
+            raise ConfigError(f"{path}: column {name!r} holds {wrong}, no whole number; {_AGAIN}")
+        kind = torch.bool if name in ("success", "trained") else torch.int64
+        columns[name] = torch.from_numpy(content[name]).to(kind)
+    scene = torch.tensor([index[name] for name in content["scene"]])
     return Episodes(scene=scene, **columns, scene_names=names, max_steps=max_steps)
 
 
@@ -190,18 +191,6 @@ def split_name(source: str | Path) -> tuple[str, Path]:
     return "", Path(text)
 
 
-def _read_json(path: Path) -> dict[str, Any]:
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError as error:
-        raise ConfigError(f"{path} is missing; give the folder of a run of recipes/train.py") from error
-    except (OSError, ValueError) as error:
-        raise ConfigError(f"{path} cannot be read ({error}); write it again") from error
-    if not isinstance(content, dict):
-        raise ConfigError(f"{path} holds no settings; write it again")
-    return content
-
-
 def _evaluation(folder: Path) -> tuple[Episodes | None, list[dict[str, Any]], str]:
     """Of a run's evaluations the one with the most goals; of equals, recipes/zero_shot.py's."""
     found: list[tuple[int, Episodes, list[dict[str, Any]], str]] = []
@@ -209,7 +198,7 @@ def _evaluation(folder: Path) -> tuple[Episodes | None, list[dict[str, Any]], st
         table, summary = folder / f"{stem}_episodes.csv", folder / f"{stem}.json"
         if not table.is_file() or not summary.is_file():
             continue
-        content = _read_json(summary)
+        content = read_json(summary, ConfigError, _AGAIN)
         settings, rows = content.get("settings", {}), content.get("rows", [])
         episodes = read_episodes(table, int(settings.get("max_steps", MAX_STEPS)))
         own = rows[0]["policy"] if rows else ""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import uuid
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -11,8 +12,8 @@ from typing import Any
 import h5py
 import numpy as np
 
+from vusfa import limits
 from vusfa.errors import SceneError
-from vusfa.scenes.limits import size_fault
 
 __all__ = ["dataset_in", "opened", "plain", "replaced"]
 
@@ -65,7 +66,7 @@ def dataset_in(file: h5py.File, name: str) -> h5py.Dataset | None:
 
     Raises:
         OSError: it lies outside the file (a link, external storage, a virtual dataset), or declares more than
-            :mod:`vusfa.scenes.limits` allows. Nothing outside the file is opened.
+            :mod:`vusfa.limits` allows. Nothing outside the file is opened.
     """
     link = file.get(name, getlink=True)
     if link is None:
@@ -81,6 +82,23 @@ def dataset_in(file: h5py.File, name: str) -> h5py.Dataset | None:
     if fault is not None:
         raise OSError(fault)
     return found
+
+
+def size_fault(dataset: h5py.Dataset) -> str | None:
+    """The fault of a dataset that declares more than it can hold; None when it does not."""
+    if dataset.shape and dataset.shape[0] > limits.MAX_STATES:
+        return f"declares {dataset.shape[0]} states; at most {limits.MAX_STATES} are read"
+    stored = dataset.id.get_storage_size()
+    times = limits.MAX_PICTURE_COMPRESSION if dataset.ndim == 4 else limits.MAX_COMPRESSION
+    if dataset.nbytes > max(limits.UNCOMPRESSED_BYTES, times * stored):
+        return (
+            f"declares {dataset.nbytes} bytes, but {stored} are stored; at most {times} times that are read"
+        )
+    if dataset.chunks and math.prod(dataset.chunks) * dataset.dtype.itemsize > limits.MAX_CHUNK_BYTES:
+        return (
+            f"has chunks of shape {dataset.chunks}; at most {limits.MAX_CHUNK_BYTES} bytes a chunk are read"
+        )
+    return None
 
 
 def plain(value: Any) -> Any:

@@ -8,21 +8,26 @@ counts: it is exact.
 from __future__ import annotations
 
 import io
+import os
 from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
+from typing import IO
 
 import h5py
 import numpy as np
 from PIL import Image, UnidentifiedImageError
 
+from vusfa import limits
 from vusfa.errors import SceneError
 from vusfa.scenes.hdf5 import dataset_in, opened
-from vusfa.scenes.limits import MAX_PICTURE_SIDE, PICTURE_FORMATS
 
 __all__ = [
     "decode",
     "look",
+    "open_image",
     "picture_faults",
+    "raw_blocks",
     "read_jpegs",
     "read_pictures",
     "to_jpeg",
@@ -43,27 +48,39 @@ def _find(file: h5py.File) -> tuple[str, h5py.Dataset] | None:
     return None
 
 
-def decode(encoded: bytes) -> np.ndarray:
-    """A JPEG or PNG file as (H, W, 3) uint8.
+@contextmanager
+def open_image(source: str | os.PathLike[str] | IO[bytes]) -> Iterator[Image.Image]:
+    """A JPEG or PNG file, open for decoding within a ``with`` block.
 
     Raises:
-        OSError: it is no picture of these formats, damaged, or larger than allowed.
+        OSError: whatever is wrong with it, in opening or in decoding.
     """
     try:
-        with Image.open(io.BytesIO(encoded), formats=PICTURE_FORMATS) as image:
-            if max(image.size) > MAX_PICTURE_SIDE:
-                raise OSError(f"{image.width} x {image.height} pixels; at most {MAX_PICTURE_SIDE} a side")
-            return np.asarray(image.convert("RGB"))
+        with Image.open(source, formats=limits.PICTURE_FORMATS) as image:
+            yield image
     except UnidentifiedImageError as error:
-        # Pillow's own words name an address in memory.
-        raise OSError("unknown format") from error
-    except (
-        Image.DecompressionBombError,
-        Image.DecompressionBombWarning,
-        ValueError,
-        SyntaxError,
-    ) as error:  # of damaged files, and of huge ones
-        raise OSError(str(error)) from error
+        raise OSError("unknown format") from error  # Pillow's own words name an address in memory
+    except OSError:
+        raise
+    except Exception as error:  # Pillow's decoders raise nearly anything for damaged bytes
+        raise OSError(f"{type(error).__name__}: {error}") from error
+
+
+def decode(encoded: bytes, shape: tuple[int, ...] | None = None) -> np.ndarray:
+    """Decode a JPEG or PNG file to (H, W, 3) uint8; ``shape`` is the one that it must have.
+
+    Raises:
+        OSError: it is no picture of these formats, damaged, larger than allowed, or of another shape.
+    """
+    if encoded.count(b"\xff\xda") > limits.MAX_PICTURE_SCANS:
+        raise OSError(f"more than {limits.MAX_PICTURE_SCANS} scans")
+    with open_image(io.BytesIO(encoded)) as image:
+        size = (image.height, image.width)
+        if max(size) > limits.MAX_PICTURE_SIDE:
+            raise OSError(f"{image.width} x {image.height} pixels; at most {limits.MAX_PICTURE_SIDE} a side")
+        if shape is not None and shape[:2] != size:
+            raise OSError(f"{size} in size, and state 0 is {shape[:2]}")
+        return np.asarray(image.convert("RGB"))
 
 
 def to_jpeg(picture: np.ndarray) -> bytes:
@@ -95,14 +112,14 @@ def look(file: h5py.File, num_states: int | None) -> tuple[tuple[int, int, int] 
             f"dataset {name!r} has {len(dataset)} pictures, but the graph has {num_states} states;"
             f" write one per state, or leave it out"
         ]
-    if name == _RAW and max(dataset.shape[1:3]) > MAX_PICTURE_SIDE:
-        return None, [f"{held}; make the pictures smaller, at most {MAX_PICTURE_SIDE} pixels a side"]
+    if name == _RAW and max(dataset.shape[1:3]) > limits.MAX_PICTURE_SIDE:
+        return None, [f"{held}; make the pictures smaller, at most {limits.MAX_PICTURE_SIDE} pixels a side"]
     if name == _RAW:
         return (dataset.shape[1], dataset.shape[2], 3), []
     try:
         height, width, _ = decode(dataset[0].tobytes()).shape
     except OSError as error:
-        return None, [f"dataset {name!r}, state 0: is no picture ({error}); write it again"]
+        return None, [f"dataset {name!r}, state 0: is unusable ({error}); write it again"]
     return (height, width, 3), []
 
 
@@ -131,46 +148,33 @@ def read_pictures(path: Path, ids: np.ndarray) -> np.ndarray:
             raise SceneError(f"{path}: there is no state {wrong}; the states are 0..{len(dataset) - 1}")
         if name == _RAW:
             return dataset[states][back]
-        # At least one is decoded, for its size, when none is asked for.
-        jpegs = dataset[states] if len(states) else dataset[:1]
-    return _decode_all(path, states, jpegs)[back]
-
-
-def _decode_all(path: Path, states: np.ndarray, jpegs: Sequence[np.ndarray]) -> np.ndarray:
-    pictures: list[np.ndarray] = []
-    for index, jpeg in enumerate(jpegs):
-        state = states[index] if len(states) else 0
+        # One at a time: entries can share their bytes in the file, and would not share them in memory.
         try:
-            pictures.append(decode(jpeg.tobytes()))
+            state = 0
+            first = decode(dataset[0].tobytes())
+            decoded = np.empty((len(states), *first.shape), np.uint8)
+            for row, state in enumerate(states.tolist()):
+                decoded[row] = decode(dataset[state].tobytes(), first.shape)
         except OSError as error:
             raise SceneError(
-                f"{path}: dataset {_JPEG!r}, state {state}: is no picture ({error}); write it again"
+                f"{path}: dataset {_JPEG!r}, state {state}: is unusable ({error}); write it again"
             ) from error
-        if pictures[-1].shape != pictures[0].shape:
-            raise SceneError(
-                f"{path}: dataset {_JPEG!r}, state {state}: is {pictures[-1].shape[:2]} in size, state"
-                f" {states[0]} is {pictures[0].shape[:2]}; write all in one size"
-            )
-    return np.stack(pictures)
+        return decoded[back]
 
 
 def raw_blocks(path: Path, num_states: int) -> Iterator[np.ndarray]:
     """All pictures of a file in order, some (n, H, W, 3) at a time."""
-    for first in range(0, num_states, _AT_ONCE):
-        yield read_pictures(path, np.arange(first, min(first + _AT_ONCE, num_states)))
+    size = read_pictures(path, np.arange(min(1, num_states))).nbytes
+    at_once = max(1, min(_AT_ONCE, limits.MAX_PICTURE_BYTES // max(size, 1)))
+    for first in range(0, num_states, at_once):
+        yield read_pictures(path, np.arange(first, min(first + at_once, num_states)))
 
 
 def picture_faults(path: Path, num_states: int) -> list[str]:
-    """Read every picture; the first fault among them, or an empty list."""
-    first_shape = None
+    """Decode every picture; the first fault among them, or an empty list."""
     try:
-        for number, block in enumerate(raw_blocks(path, num_states)):
-            first_shape = first_shape or block.shape[1:]
-            if block.shape[1:] != first_shape:
-                return [
-                    f"{path}: dataset {_JPEG!r}, state {number * _AT_ONCE}: is {block.shape[1:3]} in size,"
-                    f" state 0 is {first_shape[:2]}; write all in one size"
-                ]
+        for _ in raw_blocks(path, num_states):
+            pass
     except SceneError as error:
         return [str(error)]
     return []
@@ -184,9 +188,9 @@ def read_jpegs(path: Path) -> list[bytes] | None:
             return None
         jpegs: list[bytes] = []
         left = path.stat().st_size
-        for first in range(0, len(found[1]), _AT_ONCE):
-            jpegs += [jpeg.tobytes() for jpeg in found[1][first : first + _AT_ONCE]]
-            left -= sum(map(len, jpegs[first:]))
+        for state in range(len(found[1])):
+            jpegs.append(found[1][state].tobytes())
+            left -= len(jpegs[-1])
             if left < 0:
                 raise SceneError(f"{path}: dataset {_JPEG!r} has more bytes than the file; write it again")
         return jpegs

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from vusfa.errors import SceneError
+from vusfa.limits import MAX_FAULTS
 from vusfa.scenes.graph import shortest_path_distances
 
 if TYPE_CHECKING:
@@ -55,7 +56,9 @@ def raise_faults(source: str | os.PathLike[str], faults: Sequence[str]) -> None:
     if len(faults) == 1:
         raise SceneError(f"{source}: {faults[0]}")
     if faults:
-        lines = "".join(f"\n  - {fault}" for fault in faults)
+        lines = "".join(f"\n  - {fault}" for fault in faults[:MAX_FAULTS])
+        if len(faults) > MAX_FAULTS:
+            lines += f"\n  - and {len(faults) - MAX_FAULTS} more"
         raise SceneError(f"{source}: {len(faults)} faults{lines}")
 
 

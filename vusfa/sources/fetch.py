@@ -19,12 +19,11 @@ from dataclasses import dataclass, field, fields
 from pathlib import Path, PurePosixPath
 from typing import Any
 
-import yaml
-
 from vusfa.errors import ConfigError, SceneError
+from vusfa.limits import brief
+from vusfa.reading import read_yaml
 from vusfa.scenes import store
 from vusfa.scenes.hdf5 import opened
-from vusfa.scenes.limits import brief, read_text
 from vusfa.sources.download import Patience, download
 
 __all__ = ["Archive", "archives", "arrived_faults", "fetch"]
@@ -63,10 +62,7 @@ def archives(config: str | os.PathLike[str] | None = None) -> dict[str, Archive]
     {'bathroom_02': 180, 'bedroom_04': 408, 'kitchen_02': 676, 'living_room_08': 468}
     """
     path = _CONFIG if config is None else Path(config)
-    try:
-        entries = yaml.safe_load(read_text(path))
-    except (OSError, UnicodeDecodeError, yaml.YAMLError, RecursionError) as error:
-        raise ConfigError(f"{path}: cannot be read as YAML ({error}); correct it") from error
+    entries = read_yaml(path, ConfigError, "correct it")
     if not isinstance(entries, dict) or not all(isinstance(entry, dict) for entry in entries.values()):
         raise ConfigError(f"{path}: must map names to archives; see {_CONFIG} for an example")
     return {str(name): _archive(f"{path}: {name}", str(name), entry) for name, entry in entries.items()}

@@ -9,6 +9,7 @@ line.
 from __future__ import annotations
 
 import csv
+import io
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -17,6 +18,8 @@ from pathlib import Path
 import numpy as np
 
 from vusfa.errors import SceneError
+from vusfa.limits import MAX_TABLE_BYTES, brief
+from vusfa.reading import read_text
 from vusfa.scenes.graph import default_actions
 from vusfa.scenes.validation import raise_faults
 
@@ -60,8 +63,8 @@ def read_poses(path: Path) -> Poses:
             faults.append(f"line {line}: column 'file' is empty; name the picture")
         elif file in files:
             faults.append(
-                f"line {line}: {file} has a pose already, in line {files[file]}; every pose needs a picture"
-                f" of its own"
+                f"line {line}: {brief(file)} has a pose already, in line {files[file]}; every pose needs a"
+                f" picture of its own"
             )
         found = []
         for column in ("x", "z", "heading"):
@@ -71,7 +74,7 @@ def read_poses(path: Path) -> Poses:
                 found.append(math.nan)
             if not math.isfinite(found[-1]):
                 unit = "degrees" if column == "heading" else "metres"
-                faults.append(f"line {line}: {column!r} is {row[column]!r}; write a number, in {unit}")
+                faults.append(f"line {line}: {column!r} is {brief(row[column])}; write a number, in {unit}")
         files.setdefault(file, line)
         numbers.append(found)
     if not numbers and not faults:
@@ -115,7 +118,8 @@ def read_edges(path: Path, states: Sequence[str]) -> tuple[np.ndarray, tuple[str
         named = (row["state"],) if blocked else (row["state"], row["next"])
         unknown = [name for name in named if name and name not in number]
         faults += [
-            f"line {line}: there is no state {name!r}; states are the pictures' names" for name in unknown
+            f"line {line}: there is no state {brief(name)}; states are the pictures' names"
+            for name in unknown
         ]
         for column in ("state", "action"):
             if not row[column]:
@@ -127,7 +131,7 @@ def read_edges(path: Path, states: Sequence[str]) -> tuple[np.ndarray, tuple[str
         result = -1 if blocked else number[row["next"]]
         if move in moves and moves[move][0] != result:
             faults.append(
-                f"line {line}: {row['action']} from {row['state']} has another result in line"
+                f"line {line}: {brief(row['action'])} from {brief(row['state'])} has another result in line"
                 f" {moves[move][1]}; take one of the lines out"
             )
         moves.setdefault(move, (result, line))
@@ -144,22 +148,20 @@ def read_edges(path: Path, states: Sequence[str]) -> tuple[np.ndarray, tuple[str
 
 def _rows(path: Path, columns: Sequence[str]) -> Iterator[tuple[int, dict[str, str]]]:
     """Lines of a CSV with their numbers, blank ones left out, values without spaces around them."""
+    # A BOM is what spreadsheets put in front.
+    text = read_text(path, SceneError, "save it as UTF-8 with commas", MAX_TABLE_BYTES, "utf-8-sig")
+    reader = csv.reader(io.StringIO(text, newline=""))
     try:
-        # A BOM is what spreadsheets put in front.
-        with path.open(encoding="utf-8-sig", newline="") as file:
-            reader = csv.reader(file)
-            header = [name.strip().lower() for name in next(reader, [])]
-            missing = [name for name in columns if name not in header]
-            if missing:
-                raise SceneError(
-                    f"{path}: line 1: column {missing[0]!r} is missing; the first line must name the columns:"
-                    f" {','.join(columns)} (found: {','.join(header) or 'nothing'})"
-                )
-            for cells in reader:
-                if any(cell.strip() for cell in cells):
-                    values = dict(zip(header, (cell.strip() for cell in cells), strict=False))
-                    yield reader.line_num, {name: values.get(name, "") for name in columns}
-    except FileNotFoundError as error:
-        raise SceneError(f"{path}: there is no such file; check the path") from error
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        header = [name.strip().lower() for name in next(reader, [])]
+        missing = [name for name in columns if name not in header]
+        if missing:
+            raise SceneError(
+                f"{path}: line 1: column {missing[0]!r} is missing; the first line must name the columns:"
+                f" {','.join(columns)} (found: {brief(','.join(header)) if header else 'nothing'})"
+            )
+        for cells in reader:
+            if any(cell.strip() for cell in cells):
+                values = dict(zip(header, (cell.strip() for cell in cells), strict=False))
+                yield reader.line_num, {name: values.get(name, "") for name in columns}
+    except csv.Error as error:
         raise SceneError(f"{path}: cannot be read as CSV ({error}); save it as UTF-8 with commas") from error

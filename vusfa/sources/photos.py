@@ -11,14 +11,15 @@ import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from zipfile import BadZipFile
 
 import numpy as np
-from PIL import Image, ImageOps, UnidentifiedImageError
+from PIL import Image, ImageOps
 
 from vusfa.errors import SceneError
+from vusfa.limits import MAX_PHOTO_PIXELS
 from vusfa.scenes.graph import default_actions
-from vusfa.scenes.limits import PICTURE_FORMATS
-from vusfa.scenes.pictures import to_jpeg
+from vusfa.scenes.pictures import open_image, to_jpeg
 from vusfa.scenes.validation import raise_faults
 from vusfa.sources.capture import PoseGraph
 from vusfa.sources.grid import put_on_grid
@@ -144,15 +145,12 @@ def fit_picture(path: str | os.PathLike[str], width: int, height: int) -> np.nda
     Raises:
         OSError: it is no picture that can be read.
     """
-    try:
-        with Image.open(path, formats=PICTURE_FORMATS) as image:
-            # JPEG files of cameras are large: they can be decoded at half their size, a quarter, ...
-            image.draft("RGB", (4 * max(width, height),) * 2)
-            upright = ImageOps.exif_transpose(image).convert("RGB")
-    except UnidentifiedImageError as error:
-        raise OSError("unknown format") from error
-    except (ValueError, SyntaxError, Image.DecompressionBombError) as error:  # Pillow's, for damaged files
-        raise OSError(str(error)) from error
+    with open_image(path) as image:
+        # JPEG files of cameras are large: they can be decoded at half their size, a quarter, ...
+        image.draft("RGB", (4 * max(width, height),) * 2)
+        if image.width * image.height > MAX_PHOTO_PIXELS:
+            raise OSError(f"{image.width} x {image.height} pixels; at most {MAX_PHOTO_PIXELS} are decoded")
+        upright = ImageOps.exif_transpose(image).convert("RGB")
     return np.asarray(ImageOps.fit(upright, (width, height), Image.Resampling.LANCZOS))
 
 
@@ -210,8 +208,10 @@ def read_features(path: str | os.PathLike[str], num_states: int) -> np.ndarray:
         SceneError: the file is missing or is none, or its shape does not fit.
     """
     try:
-        values = np.load(path, allow_pickle=False)
-    except (OSError, ValueError, EOFError) as error:
+        if not Path(path).is_file():
+            raise OSError("it is no regular file")
+        values = np.load(path, mmap_mode="r", allow_pickle=False)  # held against the file's size
+    except (OSError, ValueError, EOFError, OverflowError, RecursionError, SyntaxError, BadZipFile) as error:
         raise SceneError(f"{path}: cannot be read ({error}); write it with numpy.save") from error
     if not isinstance(values, np.ndarray) or values.dtype.kind not in "fiu" or values.ndim not in (2, 3):
         held = (

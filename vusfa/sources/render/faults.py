@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 
-from vusfa.scenes.limits import MAX_PICTURE_SIDE, MAX_STATES
+from vusfa.limits import MAX_PICTURE_SIDE, MAX_STATES
 from vusfa.sources.render.outline import Rect
 from vusfa.sources.render.plan import ROLES, Plan
 from vusfa.sources.render.textures import FLOORS, WALLS

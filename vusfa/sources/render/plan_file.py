@@ -12,7 +12,8 @@ from typing import Any, Union, get_args, get_origin, get_type_hints
 import yaml
 
 from vusfa.errors import SceneError
-from vusfa.scenes.limits import MAX_FURNITURE, brief, read_text
+from vusfa.limits import MAX_FURNITURE, brief
+from vusfa.reading import parse_yaml, read_text
 from vusfa.sources.render.faults import plan_faults
 from vusfa.sources.render.plan import Plan
 
@@ -147,10 +148,7 @@ def from_yaml(text: str, source: str = "plan") -> Plan:
       - gird: there is no such key; the keys are name, size, kind, ...
       - size: [3, 2] must have 3 entries
     """
-    try:
-        content = yaml.safe_load(text)
-    except (yaml.YAMLError, RecursionError) as error:
-        raise SceneError(f"{source}: is no YAML ({error}); correct it") from error
+    content = parse_yaml(text, source, SceneError, "correct it")
     faults: list[str] = []
     plan = _build_entry(Plan, content, "", faults)
     faults = faults or plan_faults(plan)
@@ -167,12 +165,7 @@ def load_plan(path: str | os.PathLike[str]) -> Plan:
     Raises:
         SceneError: there is no such file, or see :func:`from_yaml`.
     """
-    path = Path(path)
-    try:
-        text = read_text(path)
-    except (OSError, UnicodeDecodeError) as error:
-        raise SceneError(f"{path}: cannot be read ({error}); give the file of a plan in YAML") from error
-    return from_yaml(text, str(path))
+    return from_yaml(read_text(path, SceneError, "give the file of a plan in YAML"), str(path))
 
 
 def save_plan(plan: Plan, path: str | os.PathLike[str]) -> None:

@@ -1,0 +1,78 @@
+"""Limits of what a file may declare or hold, in one table.
+
+Readers check them before anything of that size is allocated or computed, so that none takes more than 1 GB
+beyond the size of its input. They are far above every file that is known.
+"""
+
+from __future__ import annotations
+
+import reprlib
+from typing import Any
+
+__all__ = ["brief"]
+
+# ---- scenes (HDF5)
+
+#: States of a scene: its table of distances has the square of it. The largest known scene has 12,100.
+MAX_STATES = 16_384
+#: Size of a dataset over its size in the file. Tables of distances have about 10.
+MAX_COMPRESSION = 200
+#: The same for raw pictures, which are read some at a time: what gzip reaches with a single color.
+MAX_PICTURE_COMPRESSION = 1100
+#: Size of a chunk, which is read as a whole.
+MAX_CHUNK_BYTES = 1 << 28
+#: Datasets of at most this size need not keep to a compression.
+UNCOMPRESSED_BYTES = 1 << 26
+
+# ---- pictures
+
+#: Formats that pictures are decoded from; Pillow would try some forty, and start other programs for some.
+PICTURE_FORMATS = ("JPEG", "PNG")
+#: Pixels of a picture's side in a scene; pixels of a photograph that a scene is made from, as it is decoded.
+MAX_PICTURE_SIDE, MAX_PHOTO_PIXELS = 4096, 90_000_000
+#: Scans of a JPEG file, each of which is decoded over the whole picture. Progressive files have about 10.
+MAX_PICTURE_SCANS = 64
+#: Size of the decoded pictures that are looked at together.
+MAX_PICTURE_BYTES = 1 << 26
+
+# ---- text
+
+#: Size of a YAML file: goals, archives, plans, presets.
+MAX_TEXT_BYTES = 1 << 20
+#: Levels of nesting, entries of all levels, and characters of one entry in YAML.
+MAX_YAML_DEPTH, MAX_YAML_NODES, MAX_YAML_SCALAR = 20, 100_000, 10_000
+#: Size of a JSON file; Python's objects take up to 30 times that.
+MAX_JSON_BYTES = 1 << 24
+#: Size of a CSV file; its numbers take up to four times that.
+MAX_CSV_BYTES = 1 << 27
+#: Size of a CSV file of poses or moves, which become Python's objects.
+MAX_TABLE_BYTES = 1 << 24
+#: Pieces of furniture, and entries of any other kind, of a plan.
+MAX_FURNITURE = 1000
+
+# ---- arrays (NPZ)
+
+#: Size and number of elements of all arrays of a file together; readers widen elements to 8 bytes.
+MAX_NPZ_BYTES, MAX_NPZ_ELEMENTS = 1 << 28, 1 << 26
+
+# ---- archives (zip)
+
+#: Size of one read of a zip file: of its list of contents, which is read at once.
+MAX_ZIP_READ = 1 << 22
+
+# ---- messages
+
+#: Faults that one message lists.
+MAX_FAULTS = 100
+
+_BRIEF = reprlib.Repr()
+_BRIEF.maxlevel, _BRIEF.maxlist, _BRIEF.maxdict, _BRIEF.maxstring, _BRIEF.maxother = 2, 10, 10, 200, 200
+
+
+def brief(value: Any) -> str:
+    """A value of a file as messages show it: a bounded part, however much a file says.
+
+    >>> brief(list(range(1000)))
+    '[0, 1, 2, 3, 4, 5, 6, 7, 8, 9, ...]'
+    """
+    return _BRIEF.repr(value)

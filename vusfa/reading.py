@@ -1,0 +1,238 @@
+"""Readers of text, tables and arrays: only regular files, within :mod:`vusfa.limits`, one line of error."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import math
+import os
+import zipfile
+import zlib
+from array import array
+from collections.abc import Collection, Iterable
+from typing import Any
+
+import numpy as np
+import yaml
+
+from vusfa import limits
+from vusfa.errors import ResultError, VusfaError
+from vusfa.limits import brief
+
+__all__ = ["BoundedZip", "parse_yaml", "read_csv", "read_json", "read_npz", "read_text", "read_yaml"]
+
+# What Python's parsers raise for damaged or hostile text, besides errors of their own.
+_PARSING = (ValueError, OverflowError, RecursionError)
+
+
+def read_text(
+    path: str | os.PathLike[str],
+    error: type[VusfaError],
+    mend: str,
+    most: int = limits.MAX_TEXT_BYTES,
+    encoding: str = "utf-8",
+) -> str:
+    """Read a regular text file of bounded size.
+
+    Args:
+        path: the file.
+        error: class of the exception, for whatever is wrong with the file.
+        mend: end of its message, "write it again".
+        most: bytes.
+        encoding: of the text.
+
+    >>> from vusfa.errors import ConfigError
+    >>> read_text("/dev/zero", ConfigError, "give a file")
+    Traceback (most recent call last):
+    ...
+    vusfa.errors.ConfigError: /dev/zero: cannot be read (it is no regular file); give a file
+    """
+    try:
+        return _bytes(path, most).decode(encoding)
+    except FileNotFoundError as fault:
+        raise error(f"{path}: cannot be read (there is no such file); {mend}") from fault
+    except (OSError, UnicodeDecodeError) as fault:
+        raise error(f"{path}: cannot be read ({fault}); {mend}") from fault
+
+
+def _bytes(path: str | os.PathLike[str], most: int) -> bytes:
+    if os.path.exists(path) and not os.path.isfile(path):
+        raise OSError("it is no regular file")
+    with open(path, "rb") as file:
+        content = file.read(most + 1)
+    if len(content) > most:
+        raise OSError(f"it has more than {most} bytes")
+    return content
+
+
+def read_yaml(path: str | os.PathLike[str], error: type[VusfaError], mend: str) -> Any:
+    """Read one YAML document, see :func:`read_text` and :func:`parse_yaml`."""
+    return parse_yaml(read_text(path, error, mend), str(path), error, mend)
+
+
+def parse_yaml(text: str, source: str, error: type[VusfaError], mend: str) -> Any:
+    """Parse one YAML document without tags, of bounded depth and size; each alias counts as what it repeats.
+
+    >>> from vusfa.errors import ConfigError
+    >>> parse_yaml("hall: [3, 4]", "goals.yaml", ConfigError, "correct it")
+    {'hall': [3, 4]}
+    >>> parse_yaml("&hall [*hall]", "goals.yaml", ConfigError, "correct it")
+    Traceback (most recent call last):
+    ...
+    vusfa.errors.ConfigError: goals.yaml: cannot be read as YAML (an alias repeats itself); correct it
+    """
+    loader: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+    try:
+        _check_yaml(yaml.parse(text, Loader=loader))
+        return yaml.load(text, loader)
+    except (yaml.YAMLError, *_PARSING) as fault:
+        raise error(f"{source}: cannot be read as YAML ({fault}); {mend}") from fault
+
+
+def _check_yaml(events: Iterable[yaml.Event]) -> None:
+    entries = 0
+    unfinished: list[tuple[str | None, int]] = []  # anchor, and the entries before it
+    sizes: dict[str | None, int] = {}
+    for event in events:
+        entries += 1
+        if isinstance(event, yaml.AliasEvent):
+            if event.anchor in [anchor for anchor, _ in unfinished]:
+                raise ValueError("an alias repeats itself")
+            entries += sizes.get(event.anchor, 0)
+        elif isinstance(event, yaml.CollectionStartEvent):
+            unfinished.append((event.anchor, entries))
+        elif isinstance(event, yaml.CollectionEndEvent):
+            anchor, before = unfinished.pop()
+            sizes[anchor] = entries - before
+        elif isinstance(event, yaml.ScalarEvent) and len(event.value) > limits.MAX_YAML_SCALAR:
+            raise ValueError(f"an entry has more than {limits.MAX_YAML_SCALAR} characters")
+        if getattr(event, "tag", None):
+            raise ValueError("it has a tag")
+        if entries > limits.MAX_YAML_NODES:
+            raise ValueError(f"it has more than {limits.MAX_YAML_NODES} entries")
+        if len(unfinished) > limits.MAX_YAML_DEPTH:
+            raise ValueError(f"it is nested more than {limits.MAX_YAML_DEPTH} deep")
+
+
+def read_json(path: str | os.PathLike[str], error: type[VusfaError], mend: str) -> dict[str, Any]:
+    """Read a JSON file that holds an object, see :func:`read_text`."""
+    text = read_text(path, error, mend, limits.MAX_JSON_BYTES)
+    try:
+        content = json.loads(text)
+    except _PARSING as fault:
+        raise error(f"{path}: cannot be read as JSON ({fault}); {mend}") from fault
+    if not isinstance(content, dict):
+        raise error(f"{path}: holds {brief(content)} in place of an object; {mend}")
+    return content
+
+
+def read_csv(
+    path: str | os.PathLike[str], error: type[VusfaError], mend: str, words: Collection[str] = ()
+) -> dict[str, Any]:
+    """Read a CSV file of numbers.
+
+    Args:
+        path: the file; its first line names the columns.
+        error: class of the exception, for whatever is wrong with the file.
+        mend: end of its message.
+        words: columns that hold text.
+
+    Returns:
+        columns by name: (n,) float64, NaN where a field is empty or a line ends early; ``words`` as lists.
+    """
+    text = read_text(path, error, mend, limits.MAX_CSV_BYTES)
+    reader = csv.reader(io.StringIO(text, newline=""))
+    try:
+        names = next(reader, [])
+        if len(set(names)) < len(names):
+            raise ValueError("line 1 names a column twice")
+        columns: list[Any] = [[] if name in words else array("d") for name in names]
+        shared: dict[str, str] = {}
+        for fields in reader:
+            if len(fields) > len(names):
+                raise ValueError(f"line {reader.line_num} has {len(fields)} fields, line 1 {len(names)}")
+            fields += [""] * (len(names) - len(fields))
+            for column, field in zip(columns, fields, strict=True):
+                if isinstance(column, list):
+                    column.append(shared.setdefault(field, field))
+                else:
+                    column.append(float(field or "nan"))
+    except (csv.Error, ValueError) as fault:
+        raise error(f"{path}: cannot be read as CSV, line {reader.line_num} ({fault}); {mend}") from fault
+    return {
+        name: column if isinstance(column, list) else np.array(column)
+        for name, column in zip(names, columns, strict=True)
+    }
+
+
+class BoundedZip(zipfile.ZipFile):
+    """A zip file for reading whose list of contents is of bounded size, and whose members are stored or
+    deflated.
+
+    Raises:
+        OSError, zipfile.BadZipFile: it cannot be read, or is none within these limits.
+    """
+
+    class _File(io.BufferedReader):
+        reads_contents = True
+
+        def read(self, size: int | None = -1, /) -> bytes:
+            if self.reads_contents and size is not None and size > limits.MAX_ZIP_READ:
+                raise zipfile.BadZipFile(f"its list of contents has more than {limits.MAX_ZIP_READ} bytes")
+            return super().read(size)
+
+    def __init__(self, path: str | os.PathLike[str]) -> None:
+        if os.path.exists(path) and not os.path.isfile(path):
+            raise OSError("it is no regular file")
+        self._opened = self._File(io.FileIO(path))
+        try:
+            super().__init__(self._opened)
+            self._opened.reads_contents = False
+            methods = {info.compress_type for info in self.infolist()}
+            if methods - {zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED}:
+                raise zipfile.BadZipFile("it is compressed by another method than deflate")
+        except BaseException:
+            self._opened.close()
+            raise
+
+    def close(self) -> None:
+        """Close the archive and its file."""
+        super().close()
+        self._opened.close()
+
+
+def read_npz(path: str | os.PathLike[str]) -> dict[str, np.ndarray]:
+    """The arrays of a .npz file: numbers, truth values and text, no pickles.
+
+    Raises:
+        ResultError: the file is missing or damaged, holds anything else, or more than
+            :data:`vusfa.limits.MAX_NPZ_BYTES`.
+    """
+    try:
+        with BoundedZip(path) as file:
+            if sum(info.file_size for info in file.infolist()) > limits.MAX_NPZ_BYTES:
+                raise ValueError(f"its arrays have more than {limits.MAX_NPZ_BYTES} bytes")
+            arrays = {info.filename.removesuffix(".npy"): _array(file, info) for info in file.infolist()}
+        if sum(array.size for array in arrays.values()) > limits.MAX_NPZ_ELEMENTS:
+            raise ValueError(f"its arrays have more than {limits.MAX_NPZ_ELEMENTS} elements")
+        return arrays
+    except FileNotFoundError as error:
+        raise ResultError(f"{path}: cannot be read (there is no such file); make it again") from error
+    except (OSError, EOFError, zipfile.BadZipFile, zlib.error, RuntimeError, *_PARSING) as error:
+        raise ResultError(f"{path}: cannot be read ({error}); make it again") from error
+
+
+def _array(file: zipfile.ZipFile, info: zipfile.ZipInfo) -> np.ndarray:
+    """One .npy member; its header is held against its size before the array is made."""
+    content = io.BytesIO(file.read(info))
+    header = np.lib.format.read_array_header_1_0
+    if np.lib.format.read_magic(content) != (1, 0):
+        raise ValueError(f"{info.filename}: its version is not 1.0")
+    shape, column_major, dtype = header(content)
+    place = content.tell()
+    held = len(content.getbuffer()) - place
+    if dtype.kind not in "biufU" or min(shape, default=0) < 0 or dtype.itemsize * math.prod(shape) != held:
+        raise ValueError(f"{info.filename}: declares {dtype} of shape {brief(shape)} and holds {held} bytes")
+    flat = np.frombuffer(content.getbuffer(), dtype, offset=place)
+    return flat.reshape(shape, order="F" if column_major else "C").copy()
