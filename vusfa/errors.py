@@ -7,7 +7,7 @@ them.
 
 from __future__ import annotations
 
-__all__ = ["CheckpointError", "ConfigError", "GoalError", "SceneError", "VusfaError"]
+__all__ = ["CameraError", "CheckpointError", "ConfigError", "GoalError", "SceneError", "VusfaError"]
 
 
 class VusfaError(ValueError):
@@ -30,6 +30,10 @@ class GoalError(VusfaError):
 
 class CheckpointError(VusfaError):
     """A checkpoint that is damaged, or that belongs to another model or other scenes."""
+
+
+class CameraError(VusfaError):
+    """A camera, stream or folder of pictures that cannot be read."""
 
 
 class ConfigError(VusfaError):

@@ -22,7 +22,7 @@ from torch import Tensor
 
 from vusfa.errors import ConfigError
 
-__all__ = ["CROPS", "Preprocessing", "prepare"]
+__all__ = ["CROPS", "Preprocessing", "cut", "prepare"]
 
 #: Ways to cut a picture, and how many crops each gives.
 CROPS = {"whole": 1, "centre": 1, "ten": 10}
@@ -94,7 +94,7 @@ class Preprocessing:
         return f"{cut}, {self.interpolation}; (x/255 - {mean}) / {std}"
 
 
-def _cut(picture: np.ndarray, preprocessing: Preprocessing) -> np.ndarray:
+def cut(picture: np.ndarray, preprocessing: Preprocessing) -> np.ndarray:
     """The crops of one picture (H, W, 3), (C, size, size, 3) uint8."""
     image, size = Image.fromarray(picture), preprocessing.size
     resample = _FILTERS[preprocessing.interpolation]
@@ -124,7 +124,7 @@ def prepare(pictures: np.ndarray, preprocessing: Preprocessing) -> Tensor:
     >>> prepare(np.zeros((2, 30, 40, 3), np.uint8), Preprocessing(size=8, crops="ten")).shape
     torch.Size([20, 3, 8, 8])
     """
-    cuts = np.concatenate([_cut(picture, preprocessing) for picture in pictures])
+    cuts = np.concatenate([cut(picture, preprocessing) for picture in pictures])
     # A table of the 256 levels, computed in double precision, so that (x - 127) / 128 comes out exactly.
     levels = np.arange(256)[:, None] / 255
     table = ((levels - preprocessing.mean) / preprocessing.std).astype(np.float32)

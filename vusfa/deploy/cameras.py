@@ -1,0 +1,226 @@
+"""Pictures one after the other: of a folder, a film, a camera, or an address that streams them."""
+
+from __future__ import annotations
+
+import re
+import threading
+from collections.abc import Iterator
+from email.message import Message
+from http.client import HTTPException
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+from urllib.error import HTTPError
+from urllib.request import OpenerDirector, ProxyHandler, build_opener
+
+import numpy as np
+
+from vusfa.deploy.pictures import decode_upright
+from vusfa.errors import CameraError
+from vusfa.scenes.limits import brief
+
+__all__ = ["open_camera"]
+
+_ENDINGS = (".jpg", ".jpeg", ".png")
+_TIMEOUT = 10.0  # seconds
+#: Bytes of one picture of a stream.
+_MAX_BYTES = 1 << 25
+
+
+def open_camera(source: str) -> Iterator[np.ndarray]:
+    """The pictures of a source, (H, W, 3) uint8 each.
+
+    A folder's and a film's come in order, all of them. A camera's and a stream's are those of now: what came
+    while nobody asked is left out.
+
+    Args:
+        source: a folder of JPEG and PNG files, read in the order of their names (2 before 10); a number, the
+            camera that OpenCV gives it; a film, read with OpenCV; or an http address of an MJPEG stream or of
+            a single picture, which is then fetched again each time.
+
+    Raises:
+        CameraError: there is no such source, it cannot be reached, or OpenCV is missing.
+        SceneError: a file of the folder is no picture.
+
+    >>> open_camera("no/such/folder")
+    Traceback (most recent call last):
+    ...
+    vusfa.errors.CameraError: camera 'no/such/folder': no such folder or film; give a folder of pictures, a
+        camera's number, or an http address
+    """
+    if re.fullmatch(r"\d+", source):
+        return _opencv(int(source), source)
+    if re.match(r"(?i)https?://", source):
+        return _http(source)
+    path = Path(source)
+    if path.is_dir():
+        return _folder(path)
+    if path.is_file():
+        return _opencv(source, source)
+    raise CameraError(
+        f"camera {brief(source)}: no such folder or film; give a folder of pictures, a camera's number, or an"
+        " http address"
+    )
+
+
+def _folder(path: Path) -> Iterator[np.ndarray]:
+    files = [file for file in path.iterdir() if file.suffix.lower() in _ENDINGS and file.name[0] != "."]
+    if not files:
+        raise CameraError(
+            f"camera {str(path)!r}: the folder has no pictures; they end in {', '.join(_ENDINGS)}"
+        )
+    files.sort(
+        key=lambda file: [int(part) if part.isdecimal() else part for part in re.split(r"(\d+)", file.name)]
+    )
+    return (decode_upright(file.read_bytes(), str(file)) for file in files)
+
+
+def _opencv(source: int | str, name: str) -> Iterator[np.ndarray]:
+    try:
+        cv2 = import_module("cv2")
+    except ModuleNotFoundError as error:
+        raise CameraError(
+            f"camera {brief(name)}: cameras and films need OpenCV: pip install opencv-python-headless"
+        ) from error
+    capture = cv2.VideoCapture(source)
+    if not capture.isOpened():
+        capture.release()
+        raise CameraError(
+            f"camera {brief(name)}: cannot be opened; check its number, or whether it is in use"
+        )
+    if isinstance(source, str):
+        return _of_film(cv2, capture)
+    return _newest(_of_film(cv2, capture), name)
+
+
+def _of_film(cv2: Any, capture: Any) -> Iterator[np.ndarray]:
+    try:
+        while True:
+            there, picture = capture.read()
+            if not there:
+                return
+            yield cv2.cvtColor(picture, cv2.COLOR_BGR2RGB)
+    finally:
+        capture.release()
+
+
+def _http(address: str) -> Iterator[np.ndarray]:
+    opener = build_opener(ProxyHandler({}))  # cameras are near
+    response = _open(opener, address)
+    kind = response.headers.get_content_type()
+    if kind == "multipart/x-mixed-replace":
+        return _newest((decode_upright(part, address) for part in _parts(response, address)), address)
+    if kind in ("image/jpeg", "image/png"):
+        return _snapshots(opener, address, response)
+    response.close()
+    raise CameraError(
+        f"camera {address}: sends {brief(kind)}; give the address of an MJPEG stream or of a JPEG"
+    )
+
+
+def _open(opener: OpenerDirector, address: str) -> Any:
+    try:
+        return opener.open(address, timeout=_TIMEOUT)
+    except (OSError, HTTPException, ValueError) as error:
+        reason = error if isinstance(error, HTTPError) else getattr(error, "reason", error)
+        raise CameraError(f"camera {address}: cannot be reached ({reason}); check the address") from error
+
+
+def _snapshots(opener: OpenerDirector, address: str, response: Any) -> Iterator[np.ndarray]:
+    while True:
+        with response:
+            yield decode_upright(_read(response, address), address)
+        response = _open(opener, address)
+
+
+def _read(response: Any, address: str) -> bytes:
+    try:
+        content = response.read(_MAX_BYTES + 1)
+    except (OSError, HTTPException) as error:
+        raise CameraError(f"camera {address}: broke off ({error}); start again") from error
+    if len(content) > _MAX_BYTES:
+        raise CameraError(f"camera {address}: a picture has more than {_MAX_BYTES} bytes; make them smaller")
+    return content
+
+
+def _parts(response: Any, address: str) -> Iterator[bytes]:
+    """Bodies of the parts of a multipart stream; ends with it."""
+    headers: Message = response.headers
+    boundary = headers.get_param("boundary")
+    if not isinstance(boundary, str) or not boundary.strip("-"):
+        raise CameraError(
+            f"camera {address}: its stream names no boundary between pictures; use another address"
+        )
+    mark, buffer = b"--" + boundary.removeprefix("--").encode(), b""
+    with response:
+        while True:
+            try:
+                chunk = response.read1(1 << 16)
+            except (OSError, HTTPException) as error:
+                raise CameraError(f"camera {address}: broke off ({error}); start again") from error
+            buffer += chunk
+            while (part := _first_part(buffer, mark, not chunk)) is not None:
+                body, buffer = part
+                if body:
+                    yield body
+            if not chunk:
+                return
+            if len(buffer) > _MAX_BYTES:
+                raise CameraError(
+                    f"camera {address}: a picture has more than {_MAX_BYTES} bytes; make them smaller"
+                )
+
+
+def _first_part(buffer: bytes, mark: bytes, ended: bool) -> tuple[bytes, bytes] | None:
+    """Body of the first whole part, and what follows it; None while none is whole."""
+    _, found, rest = buffer.partition(mark)
+    top, gap, body = rest.partition(b"\r\n\r\n")
+    if not found or not gap:
+        return None
+    length = re.search(rb"(?im)^content-length:\s*(\d+)\s*$", top)
+    if length:
+        size = int(length[1])
+        return (body[:size], body[size:]) if len(body) >= size else None
+    picture, found, _ = body.partition(mark)
+    if found or (ended and body):
+        return picture.removesuffix(b"\r\n"), body[len(picture) :]
+    return None
+
+
+def _newest(pictures: Iterator[np.ndarray], name: str) -> Iterator[np.ndarray]:
+    """Of pictures that come by themselves, the newest at every call; a thread takes the others away."""
+    arrived, stop = threading.Condition(), threading.Event()
+    slot: list[Any] = [None, False, None]  # picture, whether it ended, fault
+
+    def take() -> None:
+        fault: Exception | None = None
+        try:
+            for picture in pictures:
+                with arrived:
+                    slot[0] = picture
+                    arrived.notify()
+                if stop.is_set():
+                    break
+        except Exception as error:
+            fault = error
+        with arrived:
+            slot[1], slot[2] = True, fault
+            arrived.notify()
+
+    thread = threading.Thread(target=take, name=f"camera {name}", daemon=True)
+    thread.start()
+    try:
+        while True:
+            with arrived:
+                if not arrived.wait_for(lambda: slot[0] is not None or slot[1], _TIMEOUT):
+                    raise CameraError(
+                        f"camera {name}: sent no picture for {_TIMEOUT:.0f} seconds; start it again"
+                    )
+                picture, slot[0] = slot[0], None
+            if picture is None:
+                if slot[2] is not None:
+                    raise slot[2]
+                return
+            yield picture
+    finally:
+        stop.set()
