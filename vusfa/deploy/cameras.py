@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import re
 import threading
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
+from contextlib import closing
 from email.message import Message
 from http.client import HTTPException
 from importlib import import_module
@@ -93,7 +94,7 @@ def _opencv(source: int | str, name: str) -> Iterator[np.ndarray]:
     return _newest(_of_film(cv2, capture), name)
 
 
-def _of_film(cv2: Any, capture: Any) -> Iterator[np.ndarray]:
+def _of_film(cv2: Any, capture: Any) -> Generator[np.ndarray, None, None]:
     try:
         while True:
             there, picture = capture.read()
@@ -109,7 +110,7 @@ def _http(address: str) -> Iterator[np.ndarray]:
     response = _open(opener, address)
     kind = response.headers.get_content_type()
     if kind == "multipart/x-mixed-replace":
-        return _newest((decode_upright(part, address) for part in _parts(response, address)), address)
+        return _newest(_of_stream(response, address), address)
     if kind in ("image/jpeg", "image/png"):
         return _snapshots(opener, address, response)
     response.close()
@@ -122,7 +123,10 @@ def _open(opener: OpenerDirector, address: str) -> Any:
     try:
         return opener.open(address, timeout=_TIMEOUT)
     except (OSError, HTTPException, ValueError) as error:
-        reason = error if isinstance(error, HTTPError) else getattr(error, "reason", error)
+        reason = getattr(error, "reason", error)
+        if isinstance(error, HTTPError):
+            error.close()
+            reason = str(error)
         raise CameraError(f"camera {address}: cannot be reached ({reason}); check the address") from error
 
 
@@ -131,6 +135,12 @@ def _snapshots(opener: OpenerDirector, address: str, response: Any) -> Iterator[
         with response:
             yield decode_upright(_read(response, address), address)
         response = _open(opener, address)
+
+
+def _of_stream(response: Any, address: str) -> Generator[np.ndarray, None, None]:
+    with closing(_parts(response, address)) as parts:
+        for part in parts:
+            yield decode_upright(part, address)
 
 
 def _read(response: Any, address: str) -> bytes:
@@ -143,11 +153,12 @@ def _read(response: Any, address: str) -> bytes:
     return content
 
 
-def _parts(response: Any, address: str) -> Iterator[bytes]:
+def _parts(response: Any, address: str) -> Generator[bytes, None, None]:
     """Bodies of the parts of a multipart stream; ends with it."""
     headers: Message = response.headers
     boundary = headers.get_param("boundary")
     if not isinstance(boundary, str) or not boundary.strip("-"):
+        response.close()
         raise CameraError(
             f"camera {address}: its stream names no boundary between pictures; use another address"
         )
@@ -187,7 +198,7 @@ def _first_part(buffer: bytes, mark: bytes, ended: bool) -> tuple[bytes, bytes] 
     return None
 
 
-def _newest(pictures: Iterator[np.ndarray], name: str) -> Iterator[np.ndarray]:
+def _newest(pictures: Generator[np.ndarray, None, None], name: str) -> Iterator[np.ndarray]:
     """Of pictures that come by themselves, the newest at every call; a thread takes the others away."""
     arrived, stop = threading.Condition(), threading.Event()
     slot: list[Any] = [None, False, None]  # picture, whether it ended, fault
@@ -195,12 +206,13 @@ def _newest(pictures: Iterator[np.ndarray], name: str) -> Iterator[np.ndarray]:
     def take() -> None:
         fault: Exception | None = None
         try:
-            for picture in pictures:
-                with arrived:
-                    slot[0] = picture
-                    arrived.notify()
-                if stop.is_set():
-                    break
+            with closing(pictures):
+                for picture in pictures:
+                    with arrived:
+                        slot[0] = picture
+                        arrived.notify()
+                    if stop.is_set():
+                        break
         except Exception as error:
             fault = error
         with arrived:
