@@ -58,7 +58,18 @@ class World:
             "agent": agent.state_dict(),
             "scenes": {"sources": sources, "names": list(scenes.names), "fingerprint": scenes.fingerprint},
             "goals": torch.tensor([3, 20]),
-            "frames": 0,
+            "config": {
+                "agent": {"model": model, "architecture": "controlled"},
+                "algorithm": {"name": "usf"},
+                "env": {},
+                "seed": 0,
+                "threads": 1,
+                "autocast": False,
+                "total_frames": 0,
+            },
+            **{"frames": 0, "updates": 0, "seconds": 0.0, "run_id": "", "overrides": []},
+            **{"optimizer": {"state": {}, "param_groups": []}, "algorithm": {}, "collector": {}, "rng": {}},
+            "meter": {"episodes": {}, "terms": {}},
         }
         return save_checkpoint(self.folder / f"{model}-{len(list(self.folder.glob('*.pt')))}.pt", state)
 

@@ -18,7 +18,7 @@ import numpy as np
 
 from vusfa.deploy.pictures import decode_upright
 from vusfa.errors import CameraError
-from vusfa.scenes.limits import brief
+from vusfa.limits import brief
 
 __all__ = ["open_camera"]
 

@@ -8,11 +8,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from PIL import Image, ImageOps, UnidentifiedImageError
+from PIL import Image, ImageOps
 from torch import Tensor
 
+from vusfa import limits
 from vusfa.errors import SceneError
-from vusfa.limits import MAX_PICTURE_SIDE, PICTURE_FORMATS
+from vusfa.scenes.pictures import open_image
 
 __all__ = ["MIN_PICTURE_SIDE", "as_picture", "decode_upright", "in_shape"]
 
@@ -39,23 +40,19 @@ def decode_upright(encoded: bytes, name: str) -> np.ndarray:
         file
     """
     try:
-        with Image.open(io.BytesIO(encoded), formats=PICTURE_FORMATS) as image:
-            if max(image.size) > MAX_PICTURE_SIDE:
-                image.draft("RGB", (MAX_PICTURE_SIDE // 2,) * 2)  # JPEG: decoded at half the size, a quarter
-            if max(image.size) > MAX_PICTURE_SIDE:
-                raise OSError(f"{image.width} x {image.height} pixels; at most {MAX_PICTURE_SIDE} per side")
+        if encoded.count(b"\xff\xda") > limits.MAX_PICTURE_SCANS:
+            raise OSError(f"more than {limits.MAX_PICTURE_SCANS} scans")
+        with open_image(io.BytesIO(encoded)) as image:
+            if max(image.size) > limits.MAX_PICTURE_SIDE:  # JPEG: decoded at half the size, or a quarter
+                image.draft("RGB", (limits.MAX_PICTURE_SIDE // 2,) * 2)
+            if max(image.size) > limits.MAX_PICTURE_SIDE:
+                size = f"{image.width} x {image.height}"
+                raise OSError(f"{size} pixels; at most {limits.MAX_PICTURE_SIDE} per side")
             return np.asarray(ImageOps.exif_transpose(image).convert("RGB"))
-    except UnidentifiedImageError:
-        reason = "unknown format"
-    except (
-        OSError,
-        ValueError,
-        SyntaxError,
-        Image.DecompressionBombError,
-        Image.DecompressionBombWarning,
-    ) as error:
-        reason = str(error)
-    raise SceneError(f"{name}: is no picture that can be read ({reason}); give a JPEG or PNG file")
+    except OSError as error:
+        raise SceneError(
+            f"{name}: is no picture that can be read ({error}); give a JPEG or PNG file"
+        ) from error
 
 
 def as_picture(picture: Any) -> tuple[np.ndarray, str]:
