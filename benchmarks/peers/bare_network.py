@@ -1,4 +1,4 @@
-"""The four models of ``preset=controlled`` as plain functions of a dictionary of tensors.
+"""The four models as plain functions of a dictionary of tensors.
 
 The weights are copied from one of our agents, so that both compute the same numbers; what differs is that no
 module, no tensordict and no dispatch stands around the products. The arithmetic is the best that is known to
@@ -69,17 +69,23 @@ class BareNetwork:
     """One of the four models.
 
     Args:
-        agent: whose weights to copy; of ``architecture=controlled``, reading ids.
+        agent: whose weights to copy; it reads ids, with an encoder of two layers that state and goal share.
         half: compute products in bfloat16.
+        few: the batches have so few rows that several frames are computed row by row, not for all states.
 
     Attributes:
         params: name to leaf tensor.
     """
 
-    def __init__(self, agent: Agent, half: bool = False) -> None:
+    def __init__(self, agent: Agent, half: bool = False, few: bool = False) -> None:
         config: dict[str, Any] = agent.config
-        if config["architecture"] != "controlled" or config["observation"] != "index":
-            raise ValueError("BareNetwork: give an agent of architecture 'controlled' that reads ids")
+        encoder = config["embedding_layer"] and config["shared_encoder"] and not config["state_layer"]
+        if config["architecture"] == "reference" or config["observation"] != "index" or not encoder:
+            raise ValueError(
+                "BareNetwork: give an agent that reads ids, of architecture 'controlled' or 'paper', with an"
+                " encoder of two layers"
+            )
+        self.few = few and config["history"] > 1
         self.ideas, self.config, self.half = MODELS[config["model"]], config, half
         self.params: Weights = {}
         self.num_scenes = agent.scene_layer.linear.num_scenes
@@ -94,8 +100,11 @@ class BareNetwork:
         return {k: v.bfloat16() for k, v in self.params.items()} if self.half else self.params
 
     def states(self, w: Weights) -> Tensor:
-        """What of the encoder depends on single states: (S, code) with one frame, else (S * H, hidden)."""
+        """What of the encoder depends on single states: (S, code) with one frame, else (S * H, hidden);
+        nothing with few rows."""
         first = w["encoder.first.weight"]
+        if self.few:
+            return self.table[:0]
         if len(first) == 1:
             return self._finish(w, functional.linear(self.table, first[0], w["encoder.first.bias"]))
         return functional.linear(self.table, first.flatten(0, 1)).view(-1, first.shape[1])
@@ -104,7 +113,7 @@ class BareNetwork:
         """Encode the goals ``ids`` (G,)."""
         first = functional.linear(self.table[ids], w["encoder.first.weight"].sum(0), w["encoder.first.bias"])
         loc, scale = self._gaussian(self._finish(w, first).float())
-        embedding = functional.layer_norm(loc, loc.shape[-1:])
+        embedding = self._phi(loc)
         fusion = w["fusion.linear.weight"][:, loc.shape[-1] :]
         fused = functional.linear(embedding.to(fusion.dtype), fusion, w["fusion.linear.bias"])
         return Goals(fused, loc, scale, embedding)
@@ -116,14 +125,18 @@ class BareNetwork:
             code = functional.embedding(rows.state.squeeze(-1), states)
         else:
             history = rows.state.shape[-1]
-            places = rows.state * history + torch.arange(history)
-            sums = functional.embedding_bag(places, states, mode="sum")
+            if self.few:
+                frames = zip(rows.state.unbind(1), w["encoder.first.weight"].unbind(0), strict=True)
+                sums = torch.stack([functional.linear(self.table[ids], one) for ids, one in frames]).sum(0)
+            else:
+                places = rows.state * history + torch.arange(history)
+                sums = functional.embedding_bag(places, states, mode="sum")
             code = self._finish(w, sums + w["encoder.first.bias"], half=acting and self.ideas.bottleneck)
         if acting:
             loc, scale = code.float()[:, : self.config["embedding_size"]], None
         else:
             loc, scale = self._gaussian(code.float())
-        embedding = functional.layer_norm(loc, loc.shape[-1:])
+        embedding = self._phi(loc)
         half = w["fusion.linear.weight"].dtype
         fused = functional.linear(
             embedding.to(half), w["fusion.linear.weight"][:, : loc.shape[-1]]
@@ -136,7 +149,9 @@ class BareNetwork:
         else:
             value = self._scene(w, "value.linear", hidden, rows).float().squeeze(-1)
         if successor is not None and self.ideas.successor_policy:
-            constant = functional.layer_norm(successor.detach(), successor.shape[-1:], eps=1e-6)
+            constant = successor.detach()
+            if self.config["successor_norm"] is not None:
+                constant = functional.layer_norm(constant, successor.shape[-1:], eps=1e-6)
             both = torch.cat([hidden, constant.to(half)], -1)
             logits = self._scene(w, "policy.last", self._scene(w, "policy.first", both, rows).relu(), rows)
         else:
@@ -171,6 +186,9 @@ class BareNetwork:
         outputs = len(w["encoder.last.bias"]) // (2 if half else 1)
         last = w["encoder.last.weight"][:outputs], w["encoder.last.bias"][:outputs]
         return functional.linear(first.relu(), *last)
+
+    def _phi(self, loc: Tensor) -> Tensor:
+        return functional.layer_norm(loc, loc.shape[-1:]) if self.config["normalize_embedding"] else loc
 
     def _gaussian(self, code: Tensor) -> tuple[Tensor, Tensor | None]:
         if not self.ideas.bottleneck:

@@ -16,6 +16,7 @@ from torch import Tensor
 
 from benchmarks.peers.bare_env import BareEnv
 from benchmarks.peers.bare_network import BareNetwork, Goals, Outputs, Rows, group
+from vusfa.objectives import A3CRMSprop
 from vusfa.training import Trainer
 from vusfa.training.precision import resolve_autocast
 
@@ -63,17 +64,25 @@ class BareTraining:
     """A training by hand.
 
     Args:
-        trainer: ours, whose settings, weights, goals and scenes are taken over. Adam, and lambda returns up
-            to the rollout's end, are what it knows.
+        trainer: ours, whose settings, weights, goals and scenes are taken over. Adam or A3C's step for the
+            whole batch, and lambda returns up to the rollout's end, are what it knows.
     """
 
     def __init__(self, trainer: Trainer) -> None:
         cfg = trainer.settings
         self.optim, self.objective, self.entropy = cfg["optim"], cfg["objective"], cfg["entropy"]
-        if self.optim["kind"] != "adam":
-            raise ValueError("BareTraining knows optim.kind=adam alone")
-        env = cfg["env"]
-        self.net = BareNetwork(trainer.agent, half=resolve_autocast(cfg["autocast"], cfg["device"]))
+        env, threads = cfg["env"], trainer.algorithm.threads
+        rows = cfg["collector"]["num_envs"] * cfg["collector"]["rollout"]
+        if self.optim["kind"] not in ("adam", "a3c_rmsprop") or threads not in (
+            None,
+            cfg["collector"]["num_envs"],
+        ):
+            raise ValueError("BareTraining knows optim=adam, and optim=a3c with one step per batch")
+        self.net = BareNetwork(
+            trainer.agent,
+            half=resolve_autocast(cfg["autocast"], cfg["device"]),
+            few=2 * rows < trainer.scenes.num_states,
+        )
         self.params = list(self.net.params.values())
         self.goal_ids = trainer.goals
         self.slot = torch.zeros(trainer.scenes.num_states, dtype=torch.int64)
@@ -90,9 +99,13 @@ class BareTraining:
             step_reward=env["step_reward"],
         )
         self.beta = torch.tensor(float(self.objective["bottleneck_coeff"]))
-        self.optimizer = torch.optim.Adam(
-            self.params, lr=self.optim["lr"], **{"fused": True, **self.optim["options"]}
-        )
+        self.threads = threads or 1
+        options = {key: value for key, value in self.optim["options"].items() if key != "threads_per_update"}
+        self.optimizer: torch.optim.Optimizer
+        if threads is None:
+            self.optimizer = torch.optim.Adam(self.params, lr=self.optim["lr"], **{"fused": True, **options})
+        else:
+            self.optimizer = A3CRMSprop(self.params, lr=self.optim["lr"], threads=threads, **options)
         self.frames = 0
 
     def collect(self) -> int:
@@ -128,10 +141,12 @@ class BareTraining:
             group_["lr"] = self._annealed(self.optim["lr"], 0.0, self.optim["horizon"])
         self.optimizer.zero_grad()
         loss.backward()
-        torch.nn.utils.clip_grad_norm_(self.params, self.optim["max_grad_norm"])
+        if not isinstance(self.optimizer, A3CRMSprop):  # which clips by itself
+            torch.nn.utils.clip_grad_norm_(self.params, self.optim["max_grad_norm"])
         self.optimizer.step()
         if kl is not None:
-            step, target = self.objective["bottleneck_step_size"], self.objective["information_target"]
+            step = self.threads * self.objective["bottleneck_step_size"]
+            target = self.objective["information_target"]
             self.beta = (self.beta + step * (kl.detach() - target)).clamp(min=0.0)
         self.frames += batch.reward.numel()
         return batch.reward.numel()
@@ -163,7 +178,9 @@ class BareTraining:
         if out.scale is not None:
             assert goals.scale is not None
             of_goals = _divergence(goals.loc, goals.scale)[rows.goal].mean()
-            kl = 0.5 * (_divergence(out.loc, out.scale).mean() + of_goals)
+            kl = of_goals
+            if c["bottleneck_on"] == "both":
+                kl = 0.5 * (_divergence(out.loc, out.scale).mean() + of_goals)
             loss = loss + self.beta * (kl - c["information_target"])
         return loss, kl
 

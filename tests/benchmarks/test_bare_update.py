@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import pytest
 import torch
 
@@ -25,11 +27,22 @@ def _as_bare(batch, bare: BareTraining) -> Batch:
     )
 
 
-@pytest.mark.parametrize("history", [1, 4])
-@pytest.mark.parametrize("model", ["gvf", "usfa", "sfdp", "vusfa"])
-def test_loss_and_gradients_are_those_of_the_library(model: str, history: int, tiny):
+@pytest.mark.parametrize(
+    ("model", "history", "preset"),
+    [
+        *itertools.product(["gvf", "usfa", "sfdp", "vusfa"], [1, 4], ["fast"]),
+        ("vusfa", 4, "paper"),
+        ("sfdp", 1, "paper"),
+    ],
+)
+def test_loss_and_gradients_are_those_of_the_library(model: str, history: int, preset: str, tiny):
     threads = torch.get_num_threads()
-    overrides = [f"agent.model={model}", f"agent.history={history}", "collector.rollout=12"]
+    overrides = [
+        f"preset={preset}",
+        f"agent.model={model}",
+        f"agent.history={history}",
+        "collector.rollout=12",
+    ]
     with running(tiny(*overrides, "collector.num_envs=16", "objective.lmbda=0.9", "autocast=false")) as ours:
         trainer = ours.trainer
         bare, loss = BareTraining(trainer), trainer.algorithm.loss
@@ -80,6 +93,19 @@ def test_updates_move_every_weight_and_the_multiplier(tiny):
     assert bare.beta > 0
     for old, new in zip(before, bare.params, strict=True):
         assert not torch.equal(old, new)
+
+
+def test_a_step_of_the_papers_preset_is_the_librarys(tiny):
+    settings = tiny("preset=paper", "agent.model=usfa", "autocast=false", "collector.num_envs=10")
+    with running(settings) as ours:
+        bare = BareTraining(ours.trainer)
+        batch, _ = ours.trainer.update(ours.batches)
+    w, plain = bare.net.weights(), _as_bare(batch, bare)
+    loss, _ = bare.loss(w, bare.net.states(w), bare.net.goals(w, bare.goal_ids), plain)
+    loss.backward()
+    bare.optimizer.step()
+    for moved, param in zip(bare.params, ours.trainer.agent.parameters(), strict=True):
+        torch.testing.assert_close(moved, param, rtol=1e-4, atol=1e-6)
 
 
 def test_what_it_does_not_know_is_refused(tiny):

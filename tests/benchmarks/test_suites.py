@@ -29,6 +29,7 @@ PROMISED = {
         "updates, 1 frame",
         "updates, 4 frames, SB3 A2C, 5 steps",
         "updates, 4 frames, features",
+        "updates, preset=paper, bare update",
     ],
     "solve_suite": [
         "time to solve, gvf",

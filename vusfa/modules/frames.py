@@ -39,14 +39,15 @@ class FeatureFrames(nn.Module):
     table: Tensor
     mean: Tensor
     deviation: Tensor
+    _converted: Tensor | None
 
     def __init__(self, features: Tensor, lookup: bool = True, normalize: bool = False) -> None:
         super().__init__()
         table = features[:, 0].to(torch.float32).contiguous()
         self.size = table.shape[-1]
         self.normalize = normalize
-        self._converted: Tensor | None = None
         self.register_buffer("table", table if lookup else table[:0].clone(), persistent=False)
+        self.register_buffer("_converted", None, persistent=False)  # as autocast would
         if normalize:
             # A feature that never changes would be divided by nothing; it becomes 0 and stays out of the way.
             self.register_buffer("mean", table.mean(0))
@@ -63,17 +64,14 @@ class FeatureFrames(nn.Module):
     def lookup(self, ids: Tensor | None) -> Tensor:
         """Features (\\*B, F) of states (\\*B,) int64; of all S states in order for ``None``.
 
-        Under autocast all states' come as it would convert them; that is done once, because they are
-        constants.
+        Under autocast they come as it would convert them; all are converted once, because they are constants.
         """
-        if ids is not None:
-            return self.table[ids]
-        device = self.table.device.type
-        if not torch.is_autocast_enabled(device):
-            return self.table
-        if self._converted is None or self._converted.dtype != torch.get_autocast_dtype(device):
-            self._converted = for_autocast(self.table)
-        return self._converted
+        table, device = self.table, self.table.device.type
+        if torch.is_autocast_enabled(device):
+            if self._converted is None or self._converted.dtype != torch.get_autocast_dtype(device):
+                self._converted = for_autocast(table)
+            table = self._converted
+        return table if ids is None else table[ids]
 
     def _apply(self, fn: Any, recurse: bool = True) -> Any:
         """Every move of a module comes down to this; what was converted is converted anew."""

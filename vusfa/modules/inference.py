@@ -102,17 +102,22 @@ class InferencePolicy(TensorDictModuleBase):
             if scenes is not None and self.agent.is_tabular and _table_pays(scenes, goals, rows):
                 self._table = [TabularPolicy(self.agent, scenes, goals)]
             else:
-                self._layers = self._cached_layers(goals)
+                self._layers = self._cached_layers(goals, rows)
             yield
         finally:
             self._layers, self._table = before
 
-    def _cached_layers(self, goals: Tensor | None) -> _Layers:
+    def _cached_layers(self, goals: Tensor | None, rows: int | None) -> _Layers:
         trunk, *heads = (step.module for step in self.agent.actor_steps())
-        if self._whole or not trunk.encoder.by_id:
+        if self._whole or not trunk.encoder.by_id or self._computes_frames(rows):
             trunk, *heads = autocast_copy([trunk, *heads])
             return _Layers(trunk if self._whole else trunk.fused, heads)
-        return _Layers(CachedTrunk(trunk, goals).fused, autocast_copy(heads))
+        return _Layers(CachedTrunk(trunk, goals, rows).fused, autocast_copy(heads))
+
+    def _computes_frames(self, rows: int | None) -> bool:
+        """Whether a frame's features are learned, and so few are asked for that not all should be computed."""
+        frames = self.agent.encoder.frames
+        return rows is not None and 2 * rows < frames.num_states and any(True for _ in frames.parameters())
 
     def logits(self, state: Tensor, goal: Tensor, scene_id: RowScenes) -> Tensor:
         """Logits (R, A) float32 of rows.

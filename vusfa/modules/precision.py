@@ -65,7 +65,7 @@ def is_bucketed(rows: Tensor) -> bool:
     return not rows.is_cuda and for_autocast(rows).dtype == torch.bfloat16
 
 
-def padded_linear(rows: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
+def padded_linear(rows: Tensor, weight: Tensor, bias: Tensor | None = None) -> Tensor:
     """``torch.nn.functional.linear`` for a number of rows that changes from call to call.
 
     Rows of zeros are added where :func:`is_bucketed`; they add nothing to outputs or gradients.
@@ -73,7 +73,7 @@ def padded_linear(rows: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
     Args:
         rows: (R, in); with more dimensions, never padded.
         weight: (out, in).
-        bias: (out,).
+        bias: (out,), or None.
 
     Returns:
         (R, out).

@@ -7,7 +7,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from vusfa.modules.linear import SceneLinear
-from vusfa.modules.precision import autocast_copy
+from vusfa.modules.precision import autocast_copy, for_autocast, padded_linear
 from vusfa.modules.rows import RowScenes
 from vusfa.modules.siamese import SiameseEncoder, joined
 from vusfa.modules.unique import gather
@@ -92,23 +92,35 @@ class CachedTrunk:
     Args:
         trunk: reads ids. Its weights are read now; later changes do not arrive here.
         goals: (G,) ids of the only states that will be goals; None for all of the world.
+        rows: number of rows that will be asked for; None for many. With fewer rows than half of the world's
+            states, a frame is computed when it is first asked for, else all frames now.
 
     >>> from vusfa.modules.frames import FeatureFrames
     >>> trunk = SiameseTrunk(SiameseEncoder(FeatureFrames(torch.rand(12, 1, 8)), 4, 16, 6), Fusion(6, 32))
     >>> state, goal = torch.randint(12, (3, 4)), torch.tensor([1, 7, 7])
-    >>> cached = CachedTrunk(trunk, torch.tensor([7, 1]))
-    >>> torch.allclose(cached.fused(state, goal), trunk.fused(state, goal), atol=1e-6)
+    >>> for cached in (CachedTrunk(trunk, torch.tensor([7, 1])), CachedTrunk(trunk, rows=3)):
+    ...     torch.allclose(cached.fused(state, goal), trunk.fused(state, goal), atol=1e-6)
+    True
     True
     """
 
     @torch.no_grad()
-    def __init__(self, trunk: SiameseTrunk, goals: Tensor | None = None) -> None:
+    def __init__(self, trunk: SiameseTrunk, goals: Tensor | None = None, rows: int | None = None) -> None:
         encoder, fusion = trunk.encoder, trunk.fusion
         features, first = encoder.frames.lookup(None), encoder.branch.first
         (self.trunk,) = autocast_copy([trunk])
-        if encoder.history == 1:  # (S, hidden), per state
-            self.frames = fusion.state_part(encoder.embed_state(first(features.unsqueeze(-2))))
-        else:  # (S, H, hidden), per frame and place
+        self.known: Tensor | None = None  # (S, H) bool, the entries of ``frames`` that are computed
+        # one frame: (S, 1, hidden), per state; more: (S, H, hidden), per frame and place
+        if rows is not None and 2 * rows < len(features):
+            self.features = features
+            outputs = (fusion.linear if encoder.history == 1 else first).out_features
+            self.frames = for_autocast(features.new_empty(0)).new_empty(
+                len(features), encoder.history, outputs
+            )
+            self.known = torch.zeros(self.frames.shape[:2], dtype=torch.bool, device=features.device)
+        elif encoder.history == 1:
+            self.frames = fusion.state_part(encoder.embed_state(first(features.unsqueeze(-2)))).unsqueeze(1)
+        else:
             self.frames = first.project(features)
         self.row: Tensor | None = None
         if goals is not None:
@@ -123,13 +135,32 @@ class CachedTrunk:
     def fused(self, state: Tensor, goal: Tensor) -> Tensor:
         """(R, hidden) of ids (R, H) and (R,)."""
         encoder, fusion = self.trunk.encoder, self.trunk.fusion
+        state = state[:, -encoder.history :]
+        if self.known is not None:
+            self._compute(state, self.known)
         goal_part = gather(self.goals, goal if self.row is None else self.row[goal])
         if encoder.history == 1:
-            state_part = gather(self.frames, state[:, -1])
+            state_part = gather(self.frames.squeeze(1), state.squeeze(1))
         else:
-            sums = encoder.branch.first.gather(self.frames, state[:, -encoder.history :])
-            state_part = fusion.state_part(encoder.embed_state(sums))
+            state_part = fusion.state_part(
+                encoder.embed_state(encoder.branch.first.gather(self.frames, state))
+            )
         return functional.relu(state_part + goal_part)
+
+    def _compute(self, state: Tensor, known: Tensor) -> None:
+        """Frames that are asked for at a place (R, H) for the first time."""
+        encoder, fusion = self.trunk.encoder, self.trunk.fusion
+        for place, ids in enumerate(state.unbind(1)):
+            new = ids[~known[ids, place]].unique()
+            if not len(new):
+                continue
+            layer = encoder.branch.first
+            bias = layer.bias if encoder.history == 1 else None
+            part = padded_linear(functional.embedding(new, self.features), layer.weight[place], bias)
+            if encoder.history == 1:
+                part = fusion.state_part(encoder.embed_state(part))
+            self.frames[new, place] = part
+            known[new, place] = True
 
 
 class SceneLayer(nn.Module):

@@ -18,6 +18,9 @@ from vusfa.objectives.optim import TFRMSprop
 
 __all__ = ["A3CRMSprop", "check_threads"]
 
+#: Numbers of a tensor that are updated at once on a processor.
+PIECE = 32768
+
 
 class A3CRMSprop(TFRMSprop):
     r"""TensorFlow's RMSProp, applied for several threads at once.
@@ -102,9 +105,17 @@ def _step_of_threads(param: Tensor, grad: Tensor, accumulator: Tensor, group: di
     if limit is not None and (norm := torch.linalg.vector_norm(grad)) > limit:
         grad = grad * (limit / norm)
     after, middle = alpha**threads, alpha ** ((threads + 1) / 2)
-    root = (accumulator * middle).addcmul_(grad, grad, value=1.0 - middle).add_(group["eps"])
-    accumulator.mul_(after).addcmul_(grad, grad, value=1.0 - after)
-    param.addcdiv_(grad, root.sqrt_(), value=-group["lr"] * threads)
+    for weight, slope, square in _pieces(param, grad, accumulator):
+        root = (square * middle).addcmul_(slope, slope, value=1.0 - middle).add_(group["eps"])
+        square.mul_(after).addcmul_(slope, slope, value=1.0 - after)
+        weight.addcdiv_(slope, root.sqrt_(), value=-group["lr"] * threads)
+
+
+def _pieces(*tensors: Tensor) -> Iterable[tuple[Tensor, ...]]:
+    """The same parts of tensors of one shape, each small enough to stay in a processor's cache."""
+    if tensors[0].is_cuda or not all(tensor.is_contiguous() for tensor in tensors):
+        return [tensors]
+    return zip(*(tensor.view(-1).split(PIECE) for tensor in tensors), strict=True)
 
 
 def check_threads(threads: int, threads_per_update: int | None) -> int:

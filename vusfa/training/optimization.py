@@ -46,9 +46,10 @@ def descend(
         group["lr"] = lr
     optimizer.zero_grad()
     total.backward()
-    clips_itself = isinstance(optimizer, TFRMSprop)
-    limit = float("inf") if clips_itself or max_grad_norm is None else max_grad_norm
-    norm = nn.utils.clip_grad_norm_(params, limit)
+    if isinstance(optimizer, TFRMSprop) or max_grad_norm is None:
+        norm = nn.utils.get_total_norm([param.grad for param in params if param.grad is not None])
+    else:
+        norm = nn.utils.clip_grad_norm_(params, max_grad_norm)
     optimizer.step()
     return norm
 

@@ -119,14 +119,13 @@ class Trainer:
     def collect(self, batches: Iterator[TensorDictBase]) -> TensorDictBase:
         """The collector's next batch, without an update.
 
-        The policy's answers are of the weights on entry, and what they share is computed once. Where a batch
-        has less than half as many frames as the world has states, computing step by step is cheaper; a
-        collector's workers do so, too.
+        With a single collector the policy's answers are of the weights on entry, and what they share is
+        computed once.
         """
         collector = self._collector
-        frames = collector.requested_frames_per_batch if isinstance(collector, Collector) else 0
         with self._precision(), ExitStack() as stack:
-            if self.acting is not None and 2 * frames >= self.scenes.num_states:
+            if self.acting is not None and isinstance(collector, Collector):
+                frames = collector.requested_frames_per_batch
                 stack.enter_context(self.acting.cached(self.goals, self.scenes, frames))
             return next(batches)
 
