@@ -117,7 +117,8 @@ class InferencePolicy(TensorDictModuleBase):
     def _computes_frames(self, rows: int | None) -> bool:
         """Whether a frame's features are learned, and so few are asked for that not all should be computed."""
         frames = self.agent.encoder.frames
-        return rows is not None and 2 * rows < frames.num_states and any(True for _ in frames.parameters())
+        learned = next(frames.parameters(), None) is not None
+        return learned and rows is not None and 2 * rows < frames.num_states
 
     def logits(self, state: Tensor, goal: Tensor, scene_id: RowScenes) -> Tensor:
         """Logits (R, A) float32 of rows.
