@@ -115,7 +115,7 @@ class InferencePolicy(TensorDictModuleBase):
         return _Layers(CachedTrunk(trunk, goals, rows).fused, autocast_copy(heads))
 
     def _computes_frames(self, rows: int | None) -> bool:
-        """Whether a frame's features are learned, and so few are asked for that not all should be computed."""
+        """Whether frames are learned, and so few are asked for that not all should be computed."""
         frames = self.agent.encoder.frames
         learned = next(frames.parameters(), None) is not None
         return learned and rows is not None and 2 * rows < frames.num_states
