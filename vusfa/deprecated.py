@@ -20,13 +20,15 @@ __all__ = ["MOVED_MODULES", "install", "moved_names"]
 #: Modules of version 0.1 and what they are called now.
 MOVED_MODULES: dict[str, str] = {
     "vusfa.evaluation.curve": "vusfa.report.curve",
+    "vusfa.evaluation.experiment": "vusfa.report.experiment",
     "vusfa.evaluation.files": "vusfa.files",
     "vusfa.evaluation.film": "vusfa.report.film",
     "vusfa.evaluation.floors": "vusfa.evaluation.baselines",
     "vusfa.evaluation.report": "vusfa.evaluation.summary",
     "vusfa.evaluation.results": "vusfa.experiments.runs",
+    "vusfa.evaluation.tables": "vusfa.report.result_tables",
     "vusfa.evaluation.transfer_figure": "vusfa.report.transfer_figure",
-    "vusfa.evaluation.unseen": "vusfa.experiments.generalise",
+    "vusfa.evaluation.unseen": "vusfa.report.unseen",
     "vusfa.evaluation.tabulated": "vusfa.modules.inference",
     "vusfa.modules.acting": "vusfa.modules.inference",
     "vusfa.modules.pairs": "vusfa.modules.inference",
@@ -42,7 +44,7 @@ MOVED_MODULES: dict[str, str] = {
     "vusfa.training.transfer": "vusfa.experiments.fine_tune",
     **{
         f"vusfa.evaluation.{name}": f"vusfa.experiments.{name}"
-        for name in ("experiment", "tables", "transfer", "manifest")
+        for name in ("transfer", "manifest")
     },
     **{
         f"vusfa.scenes.{name}": f"vusfa.sources.{name}"

@@ -14,7 +14,7 @@ from typing import Any
 
 from vusfa.errors import ConfigError
 
-__all__ = ["check_folder", "replacing", "write_csv", "write_json"]
+__all__ = ["check_folder", "replacing", "write_csv", "write_json", "write_text"]
 
 
 def check_folder(path: str | Path, setting: str) -> Path:
@@ -78,16 +78,17 @@ def write_csv(
     writer.writeheader()
     for row in rows:
         writer.writerow({key: "" if _is_nan(value) else value for key, value in row.items()})
-    return _write(path, text.getvalue())
+    return write_text(path, text.getvalue())
 
 
 def write_json(path: str | Path, content: Any) -> Path:
     """Write indented JSON, atomically; NaN, which JSON does not have, becomes null."""
     text = json.dumps(_without_nan(content), indent=2, ensure_ascii=False, allow_nan=False)
-    return _write(path, text + "\n")
+    return write_text(path, text + "\n")
 
 
-def _write(path: str | Path, text: str) -> Path:
+def write_text(path: str | Path, text: str) -> Path:
+    """Write UTF-8 text, atomically."""
     with replacing(path) as unfinished:
         unfinished.write_text(text, encoding="utf-8")
     return Path(path)

@@ -10,9 +10,9 @@ from torch import Tensor
 
 from vusfa.cli.functions import run_functions
 from vusfa.evaluation import Episodes, register_metric
-from vusfa.experiments.print_tables import print_tables
 from vusfa.experiments.zero_shot import zero_shot
 from vusfa.report.command import report_runs
+from vusfa.report.print_tables import print_tables
 
 
 @register_metric("perfect", label="perfect", title="Episodes on a shortest path", unit="%", exact=True)

@@ -89,7 +89,7 @@ def test_the_table_by_hand() -> None:
     assert row[6].split(" ")[0] == "25.0"
     assert row[7].split(" ")[0] == f"{(90 + 112.5 + 137.5 + 162.5) / 4:,.0f}"
     assert row[8] == "4 of 4"
-    assert lines[3].split("|")[8:10] == [" - ", " 0 of 4 "]
+    assert lines[3].split("|")[8:10] == [" – ", " 0 of 4 "]
 
 
 def test_the_picture(tmp_path: Path) -> None:

@@ -41,7 +41,7 @@ FUNCTIONS: dict[str, tuple[str, dict[str, str]]] = {
     ),
     "tables": (
         "All tables of results, with intervals; Markdown and CSV.",
-        {"": "vusfa.experiments.print_tables.print_tables"},
+        {"": "vusfa.report.print_tables.print_tables"},
     ),
     "transfer": (
         "The paper's Figure 2: run the fine-tuning towards new goals, show its figure.",

@@ -13,6 +13,7 @@ from collections.abc import Iterable, Mapping, Sequence
 import numpy as np
 import pandas as pd
 import torch
+from pandas.api.types import union_categoricals
 from torch import Tensor
 
 from vusfa.envs.dynamics import MAX_STEPS
@@ -160,35 +161,38 @@ def _rows(
     seed: int,
     mode: str,
 ) -> pd.DataFrame:
-    count = len(columns)
+    count, size = len(columns), len(goal)
     over, under = (torch.cat([parts[i] for parts in columns.values()]).numpy() for i in (0, 1))
     with np.errstate(invalid="ignore", divide="ignore"):
         value = np.where(under > 0, over / under, np.nan)
-    table = pd.DataFrame(
+    codes, places = pd.factorize(scene)
+
+    def constant(name: str) -> pd.Categorical:
+        return pd.Categorical.from_codes(np.zeros(count * size, dtype=np.int8), [name])
+
+    return pd.DataFrame(
         {
-            "run": run,
-            "model": model,
+            "run": constant(run),
+            "model": constant(model),
             "seed": seed,
-            "scene": np.tile(scene, count),
+            "scene": pd.Categorical.from_codes(np.tile(codes, count), places),
             "goal": np.tile(goal.numpy(), count),
             "trained": np.tile(trained.numpy(), count),
-            "mode": mode,
-            "metric": np.repeat(list(columns), len(goal)),
+            "mode": constant(mode),
+            "metric": pd.Categorical.from_codes(np.arange(count).repeat(size), list(columns)),
             "numerator": over,
             "denominator": under,
             "value": value,
         }
     )
-    return join_tables([table])
 
 
 def join_tables(tables: Iterable[pd.DataFrame]) -> pd.DataFrame:
     """Several long tables as one; names become categories in the order in which they first appear."""
-    table = pd.concat(tables, ignore_index=True)
-    for name in _NAMES:
-        strings = table[name].astype(object)
-        table[name] = pd.Categorical(strings, categories=strings.unique())
-    return table
+    tables = list(tables)
+    joined = {name: union_categoricals([table[name] for table in tables]) for name in _NAMES}
+    rest = pd.concat([table.drop(columns=_NAMES) for table in tables], ignore_index=True)
+    return rest.assign(**joined)[tables[0].columns]
 
 
 def pool(table: pd.DataFrame, by: Sequence[str]) -> pd.DataFrame:

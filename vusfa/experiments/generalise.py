@@ -1,32 +1,24 @@
-"""Rooms never seen: training in some rooms, tests in others, and the table of it: ``vusfa generalise``."""
+"""Rooms never seen: training in some rooms, tests in others: ``vusfa generalise``."""
 
 from __future__ import annotations
 
 import re
 import sys
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import pandas as pd
 import torch
-from torch import Tensor
 
-from vusfa.errors import ResultError, SceneError
+from vusfa.errors import SceneError
 from vusfa.evaluation import Episodes, evaluate, print_summary, random_walk_summary, summary
-from vusfa.evaluation.baselines import RANDOM_WALK
 from vusfa.evaluation.exact import exact_goals, uniform_probabilities
-from vusfa.evaluation.long_table import goal_sums
-from vusfa.evaluation.statistics import Sums, bootstrap_mean, paired_difference
-from vusfa.experiments.markdown import markdown
-from vusfa.experiments.runs import Run, read_runs, write_run
-from vusfa.experiments.tables import COMPARED
+from vusfa.experiments.runs import Run, write_run
 from vusfa.experiments.training import compose_settings, train
 from vusfa.modules import InferencePolicy, TriedActions, transplant
 from vusfa.scenes import SceneSet
 from vusfa.training import EvaluationProgress, load_agent, run_facts
 
-__all__ = ["generalise", "policies", "split_rooms", "unseen_table"]
+__all__ = ["generalise", "policies", "split_rooms"]
 
 
 def split_rooms(folder: Path, trained: int, tested: int) -> tuple[list[str], list[str]]:
@@ -77,7 +69,7 @@ def generalise(
 
     The agent, whose heads are the same for all rooms, walks to every goal of the other rooms as it is and
     with a memory of the episode; beside it the random walk and the memory alone. Results go to
-    RESULTS/generalise/NAME-SEED; the table with intervals is of all seeds that are there.
+    RESULTS/generalise/NAME-SEED; ``vusfa tables generalise`` prints the table of all seeds, with intervals.
 
     Args:
         rooms: folder of dumps (.h5).
@@ -119,42 +111,4 @@ def generalise(
     rows = [row for who, table in tables.items() for row in summary(table, who)]
     none, every = torch.tensor([], dtype=torch.int64), torch.arange(unseen.num_states)
     print_summary([*rows, *random_walk_summary(unseen, every, none)])
-    print(unseen_table([run for run in read_runs(results, "generalise") if run.name.startswith(f"{name}-")]))
-
-
-def unseen_table(runs: Sequence[Run]) -> str:
-    """Markdown: each policy's success and SPL in the rooms that it was tested in, and its success within 100
-    less the random walk's in percentage points; with 95 % bootstrap intervals over seeds and goals, goals
-    drawn within their rooms.
-
-    Args:
-        runs: one per seed, of the same rooms; their exact tables are the random walk's.
-
-    Raises:
-        ResultError: none, or they are of other rooms, or without the random walk.
-    """
-    if not runs or any(run.exact is None for run in runs):
-        raise ResultError("there are no results of recipes/generalise.py; run it first")
-    if len({tuple(run.info["tested_in"]) for run in runs}) > 1:
-        raise ResultError("the runs were tested in different rooms; show those of one set of rooms")
-    tables = [run.rows() for run in runs]
-    baseline, scene = _sums(tables, "exact")
-    rows = []
-    for mode in runs[0].episodes:
-        sums, _ = _sums(tables, mode)
-        means = {name: bootstrap_mean(sums[name], scene) for name in COMPARED}
-        gap = paired_difference(sums["success_100"], baseline["success_100"], scene)
-        rows.append({"policy": mode, "seeds": len(runs), **means, "in 100, less the random walk": gap})
-    means = {name: bootstrap_mean(baseline[name], scene) for name in COMPARED}
-    rows.append({"policy": RANDOM_WALK, "seeds": None, **means})
-    return markdown(rows, ["policy", "seeds", *COMPARED, "in 100, less the random walk"])
-
-
-def _sums(tables: Sequence[pd.DataFrame], mode: str) -> tuple[dict[str, Sums], Tensor]:
-    found = {}
-    for name in COMPARED:
-        sums = goal_sums([table[table["mode"] == mode] for table in tables], name)
-        if sums is None:
-            raise ResultError(f"the runs were tested on different goals ({mode}); show those of one set")
-        found[name], scene = sums
-    return found, scene
+    print(f"vusfa tables generalise --results {results} shows all seeds with intervals", file=sys.stderr)

@@ -10,6 +10,7 @@ import torch
 
 from vusfa.errors import ResultError
 from vusfa.evaluation.baselines import RANDOM_WALK, SHORTEST_PATH
+from vusfa.evaluation.exact import expected_walks
 from vusfa.evaluation.statistics import Estimate, Sums, bootstrap_mean
 from vusfa.experiments.runs import Run, read_runs
 from vusfa.experiments.transfer import (
@@ -19,14 +20,23 @@ from vusfa.experiments.transfer import (
     area_under,
     curves_of,
     frames_to,
-    walked_lengths,
 )
 from vusfa.files import replacing
+from vusfa.report.markdown import markdown
 from vusfa.scenes import SceneSet
 
-__all__ = ["difference_table", "draw_transfer", "mean_over", "show_transfer", "transfer_table"]
+__all__ = [
+    "baseline_lengths",
+    "difference_table",
+    "draw_transfer",
+    "mean_over",
+    "show_transfer",
+    "transfer_table",
+    "transfer_tables",
+]
 
 STARTS = (FINE_TUNED, FROM_SCRATCH)
+_MEAN = "length, mean of the curve"
 BOUNDS = (RANDOM_WALK, SHORTEST_PATH)
 PAIRS = (("usfa", "gvf"), ("sfdp", "usfa"), ("vusfa", "sfdp"), ("vusfa", "gvf"))
 _COLOURS = {"gvf": "#0072b2", "usfa": "#e69f00", "sfdp": "#009e73", "vusfa": "#cc79a7"}
@@ -47,43 +57,55 @@ def mean_over(values: Sequence[Sequence[float]]) -> Estimate:
     return bootstrap_mean(sums, torch.zeros(numbers.shape[1], dtype=torch.int64))
 
 
+def transfer_tables(runs: Sequence[Run], scenes: SceneSet, threshold: float = 250.0) -> tuple[str, str]:
+    """:func:`transfer_table` with the baselines' lengths in these scenes, and :func:`difference_table`."""
+    return transfer_table(runs, threshold, baseline_lengths(runs, scenes)), difference_table(runs)
+
+
+def baseline_lengths(runs: Sequence[Run], scenes: SceneSet) -> dict[str, list[tuple[float, float]]]:
+    """By kind, for each set of goals, the expected actions of a random walk and of the shortest path, as
+    :func:`~vusfa.experiments.transfer.walked_lengths`; every goal is computed once."""
+    sets = {run.info["kind"]: [entry["goals"] for entry in curves_of(run.info)] for run in runs}
+    goals = torch.tensor(sorted({goal for kind in sets.values() for group in kind for goal in group}))
+    walks = expected_walks(None, scenes, goals)
+    groups = {
+        kind: [torch.isin(goals, torch.tensor(group)) for group in groups] for kind, groups in sets.items()
+    }
+    return {
+        kind: [(walks.length[rows].mean().item(), walks.shortest[rows].mean().item()) for rows in masks]
+        for kind, masks in groups.items()
+    }
+
+
 def transfer_table(
     runs: Sequence[Run], threshold: float, bounds: Mapping[str, Sequence[tuple[float, float]]] | None = None
 ) -> str:
-    """Markdown: for each kind, model and way the mean length over the training, at its start and end, and the
+    """Markdown: per kind, model and start the mean length over the training, at its start and end, and the
     frames to a threshold, each with its 95 % interval over seeds and sets of goals.
 
     Args:
         runs: of the experiment.
-        threshold: actions an episode.
-        bounds: of each kind, for each set of goals the length of a random walk and of the shortest path, see
-            :func:`~vusfa.experiments.transfer.walked_lengths`; a row each below the models.
+        threshold: actions per episode.
+        bounds: see :func:`baseline_lengths`; a row each below the models.
     """
-    bounds, kinds = bounds or {}, []
-    lines = [
-        "| new goals | model | | seeds | length, mean of the curve | at first | at last |"
-        f" frames to {threshold:g} | came there |",
-        "|---|---|---|---|---|---|---|---|---|",
-    ]
+    rows, bounds, to_threshold = [], bounds or {}, f"frames to {threshold:g}"
     for kind, model, here in _groups(runs):
-        kinds += [] if kind in kinds else [kind]
         for start in STARTS:
             curves = [[entry[start] for entry in curves_of(run.info)] for run in here]
             area = mean_over([[area_under(c["frames"], c["length"]) for c in row] for row in curves])
             first, last = (mean_over([[c["length"][end] for c in row] for row in curves]) for end in (0, -1))
             to = [[frames_to(c["frames"], c["length"], threshold) for c in row] for row in curves]
             arrived = sum(not math.isnan(value) for row in to for value in row)
-            total = sum(len(row) for row in to)
-            reached = _number(mean_over(to), 0) if arrived else "-"
-            lines.append(
-                f"| {kind} | {model} | {start} | {len(here)} | {_number(area)} | {_number(first)} |"
-                f" {_number(last)} | {reached} | {arrived} of {total} |"
-            )
-    for kind in kinds:
-        for index, name in enumerate(BOUNDS if kind in bounds else ()):
-            length = _number(mean_over([[pair[index] for pair in bounds[kind]]]))
-            lines.append(f"| {kind} | {name} | – | – | {length} | – | – | – | – |")
-    return "\n".join(lines)
+            row = {"new goals": kind, "model": model, "training": start, "seeds": len(here)}
+            row |= {_MEAN: _number(area), "at first": _number(first), "at last": _number(last)}
+            row[to_threshold] = _number(mean_over(to), 0) if arrived else None
+            rows.append(row | {"came there": f"{arrived} of {sum(map(len, to))}"})
+    for kind, pairs in bounds.items():
+        for index, name in enumerate(BOUNDS):
+            length = _number(mean_over([[pair[index] for pair in pairs]]))
+            rows.append({"new goals": kind, "model": name, _MEAN: length})
+    heads = ["new goals", "model", "training", "seeds", _MEAN, "at first", "at last"]
+    return markdown(rows, [*heads, to_threshold, "came there"])
 
 
 def difference_table(runs: Sequence[Run]) -> str:
@@ -93,7 +115,7 @@ def difference_table(runs: Sequence[Run]) -> str:
     Less than 0: fewer actions than what it is compared with.
 
     Args:
-        runs: of the experiment; of seeds that both sides of a pair have.
+        runs: of the experiment; the seeds that both sides of a pair have count.
     """
     areas: dict[tuple[str, str, str], dict[int, list[float]]] = {}
     for run in runs:
@@ -101,10 +123,7 @@ def difference_table(runs: Sequence[Run]) -> str:
             here = areas.setdefault((run.info["kind"], run.info["model"], start), {})
             curves = [entry[start] for entry in curves_of(run.info)]
             here[run.info["seed"]] = [area_under(c["frames"], c["length"]) for c in curves]
-    lines = [
-        "| new goals | fine-tuned | against | seeds | difference, mean of the curve |",
-        "|---|---|---|---|---|",
-    ]
+    rows = []
     for kind in KINDS:
         models = [model for model in _COLOURS if (kind, model, STARTS[0]) in areas]
         pairs = [((model, STARTS[0]), (model, STARTS[1])) for model in models]
@@ -112,12 +131,12 @@ def difference_table(runs: Sequence[Run]) -> str:
         for one, other in pairs:
             left, right = areas[(kind, *one)], areas[(kind, *other)]
             seeds = sorted(left.keys() & right.keys())
-            if not seeds:
-                continue
-            paired = [[a - b for a, b in zip(left[s], right[s], strict=True)] for s in seeds]
-            against = other[0] if one[0] != other[0] else other[1]
-            lines.append(f"| {kind} | {one[0]} | {against} | {len(seeds)} | {_number(mean_over(paired))} |")
-    return "\n".join(lines)
+            if seeds:
+                paired = [[a - b for a, b in zip(left[s], right[s], strict=True)] for s in seeds]
+                against = other[0] if one[0] != other[0] else other[1]
+                row = {"new goals": kind, FINE_TUNED: one[0], "against": against, "seeds": len(seeds)}
+                rows.append(row | {"difference, mean of the curve": _number(mean_over(paired))})
+    return markdown(rows, list(rows[0]) if rows else [])
 
 
 def draw_transfer(
@@ -199,7 +218,6 @@ def show_transfer(
     if not found:
         raise ResultError(f"{results / experiment}: no results; run recipes/transfer.py run first")
     world = SceneSet.open(scenes or found[0].info["scenes"])
-    sets = {run.info["kind"]: [entry["goals"] for entry in curves_of(run.info)] for run in found}
-    bounds = {kind: [walked_lengths(world, torch.tensor(g)) for g in goals] for kind, goals in sets.items()}
-    print(transfer_table(found, threshold, bounds), difference_table(found), sep="\n\n")
+    print(*transfer_tables(found, world, threshold), sep="\n\n")
+    bounds = baseline_lengths(found, world)
     print(draw_transfer(found, out, bounds))

@@ -40,7 +40,7 @@ def run_facts(state: Mapping[str, Any], overrides: Sequence[str] = ()) -> dict[s
     config = state["config"]
     return {
         "model": config["agent"]["model"],
-        "agent_preset": config["agent"]["architecture"],
+        "architecture": config["agent"]["architecture"],
         "row": row_name(config),
         "seed": config["seed"],
         "overrides": list(overrides),

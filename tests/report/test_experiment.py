@@ -14,8 +14,8 @@ from vusfa.errors import ResultError
 from vusfa.evaluation import Episodes, episode_starts, evaluate, random_walk
 from vusfa.evaluation.exact import exact_goals, uniform_probabilities
 from vusfa.evaluation.long_table import distance_to_trained, episode_rows
-from vusfa.experiments.experiment import Experiment, read_experiment
 from vusfa.experiments.runs import Run, read_run, write_run
+from vusfa.report.experiment import Experiment, read_experiment
 from vusfa.scenes import Scene, SceneSet
 
 Policies = dict[str, Callable[..., Any]]
@@ -36,9 +36,9 @@ def walked(rooms: SceneSet, policies: Policies) -> Callable[..., Episodes]:
 def results(tmp_path: Path, rooms: SceneSet, walked: Callable[..., Episodes]) -> Path:
     chances = exact_goals(uniform_probabilities(4), rooms)
     for seed in (1, 0):
-        info = {"model": "vusfa", "row": "vusfa", "seed": seed, "agent_preset": "controlled"}
+        info = {"model": "vusfa", "row": "vusfa", "seed": seed, "architecture": "controlled"}
         write_run(tmp_path, Run("a", f"vusfa-{seed}", info, {"sampled": walked("dice", seed)}, chances))
-    info = {"model": "gvf", "seed": 0, "agent_preset": "paper"}
+    info = {"model": "gvf", "seed": 0, "architecture": "paper"}
     write_run(tmp_path, Run("a", "gvf-0", info, {"sampled": walked("guide", 0, rooms)}))
     return tmp_path
 

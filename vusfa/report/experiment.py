@@ -1,9 +1,10 @@
-"""Runs side by side that walked the same episodes, as one long table."""
+"""Runs side by side that were evaluated on the same episodes, as one long table."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property, lru_cache
 from pathlib import Path
 
 import pandas as pd
@@ -12,7 +13,7 @@ from torch import Tensor
 
 from vusfa.errors import ResultError
 from vusfa.evaluation.baselines import RANDOM_WALK, SHORTEST_PATH, shortest_paths
-from vusfa.evaluation.exact import exact_goals, uniform_probabilities
+from vusfa.evaluation.exact import ExactGoals, exact_goals, uniform_probabilities
 from vusfa.evaluation.long_table import distance_to_trained, episode_rows, exact_rows, join_tables
 from vusfa.evaluation.statistics import Sums
 from vusfa.experiments.runs import Run, read_runs
@@ -29,11 +30,11 @@ class Experiment:
     """Models whose runs hold the same episodes.
 
     Attributes:
-        runs: by model's label, in order of seed.
+        runs: by the model's label, in order of seed.
         scenes: the world.
         table: the long table of all runs and of the baselines, whose mode is ``exact``.
         scene, goal: (G,) int64, the goals: index of the scene, state id within it.
-        trained: (G,) bool, trained on.
+        trained: (G,) bool, whether it is a trained goal.
         distance_to_trained: (G,) int64, actions from the nearest trained goal, -1 where there is none.
     """
 
@@ -45,10 +46,10 @@ class Experiment:
     trained: Tensor
     distance_to_trained: Tensor
 
-    def __post_init__(self) -> None:
+    @cached_property
+    def _groups(self) -> dict[tuple[str, str, str], pd.DataFrame]:
         by = ["model", "mode", "metric"]
-        groups = {key: part for key, part in self.table.groupby(by, observed=True, sort=True)}
-        object.__setattr__(self, "_groups", groups)
+        return {key: part for key, part in self.table.groupby(by, observed=True, sort=True)}
 
     def seeds(self, label: str) -> list[int]:
         """Seeds of a model's runs, in order."""
@@ -61,17 +62,17 @@ class Experiment:
             label: of a model or of a baseline, which has one row, in any mode.
             mode: ``sampled``, ``greedy``, or ``exact`` where the runs have it; empty for runs that were not
                 evaluated in it.
-            seeds: those to take; all when not given. The baselines repeat their row.
+            seeds: those to take; all by default. The baselines repeat their row.
         """
         baseline = label in (RANDOM_WALK, SHORTEST_PATH)
         every = [-1] if baseline else self.seeds(label)
         rows = (
             [0] * len(seeds or [0])
             if baseline
-            else [i for i, s in enumerate(every) if seeds is None or s in seeds]
+            else [i for i, seed in enumerate(every) if seeds is None or seed in seeds]
         )
         found, shape = {}, (len(every), len(self.goal))
-        for (model, of_mode, metric), part in self._groups.items():  # type: ignore[attr-defined]
+        for (model, of_mode, metric), part in self._groups.items():
             if model == label and (baseline or of_mode == mode) and len(part) == shape[0] * shape[1] and rows:
                 over, under = (torch.tensor(part[name].to_numpy()) for name in ("numerator", "denominator"))
                 found[metric] = Sums(over.view(shape)[rows], under.view(shape)[rows])
@@ -84,7 +85,7 @@ def read_experiment(root: str | Path, names: Sequence[str], scenes: SceneSet | N
     Args:
         root: folder of results.
         names: of the experiments.
-        scenes: the world; those that the runs name when not given.
+        scenes: the world; the scenes that the runs name by default.
 
     Raises:
         ResultError: there is no run, one is damaged, or one has other episodes; the scenes are others.
@@ -105,26 +106,31 @@ def read_experiment(root: str | Path, names: Sequence[str], scenes: SceneSet | N
                     f" {runs[0].name}; give experiments of one manifest and the same trained goals"
                 )
     scenes = SceneSet.open(list(runs[0].info["scenes"])) if scenes is None else scenes
-    walked = runs[0].info.get("scenes_fingerprint", scenes.fingerprint)
-    if walked != scenes.fingerprint:
+    evaluated = runs[0].info.get("scenes_fingerprint", scenes.fingerprint)
+    if evaluated != scenes.fingerprint:
         where = Path(root) / runs[0].experiment / runs[0].name
         raise ResultError(
-            f"{where}: of other scenes (fingerprint {walked[:12]}, and"
-            f" {', '.join(scenes.names)} have {scenes.fingerprint[:12]}); give those that it was walked in"
+            f"{where}: of other scenes (fingerprint {evaluated[:12]}, and"
+            f" {', '.join(scenes.names)} have {scenes.fingerprint[:12]}); give those of its evaluation"
         )
     groups: dict[str, list[Run]] = {}
     for run in sorted(runs, key=_order):
         groups.setdefault(run.label, []).append(run)
-    ceiling = episode_rows(shortest_paths(first), SHORTEST_PATH, mode="exact")
-    goals = ceiling[["scene", "goal", "trained"]].drop_duplicates()
-    random_walk = exact_goals(uniform_probabilities(scenes.num_actions), scenes)
-    walk = exact_rows(random_walk, goals, scenes.names, RANDOM_WALK)
-    tables = [run.rows(goals) for runs in groups.values() for run in runs]
+    shortest = episode_rows(shortest_paths(first), SHORTEST_PATH, mode="exact")
+    goals = shortest[["scene", "goal", "trained"]].drop_duplicates()
+    walk = exact_rows(_random_walk(scenes), goals, scenes.names, RANDOM_WALK)
+    tables = [run.rows(goals) for group in groups.values() for run in group]
     number = {name: index for index, name in enumerate(first.scene_names)}
     scene = torch.tensor([number[name] for name in goals.scene])
     goal, trained = (torch.tensor(goals[name].to_numpy()) for name in ("goal", "trained"))
     distance = distance_to_trained(scenes, scene, goal, trained)
-    return Experiment(groups, scenes, join_tables([*tables, walk, ceiling]), scene, goal, trained, distance)
+    return Experiment(groups, scenes, join_tables([*tables, walk, shortest]), scene, goal, trained, distance)
+
+
+@lru_cache(maxsize=1)
+def _random_walk(scenes: SceneSet) -> ExactGoals:
+    """Kept, because several tables of the same rooms are often made in one go."""
+    return exact_goals(uniform_probabilities(scenes.num_actions), scenes)
 
 
 def _order(run: Run) -> tuple[int, str, int]:

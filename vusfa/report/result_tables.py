@@ -7,6 +7,7 @@ are over goals, each of which weighs the same, unless a row says "mean of scenes
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from functools import lru_cache
 from typing import Any
 
@@ -31,14 +32,15 @@ from vusfa.evaluation.statistics import (
     make_draws,
     paired_difference,
 )
-from vusfa.experiments.experiment import Experiment
 from vusfa.modules.config import MODELS
+from vusfa.report.experiment import Experiment
 
 __all__ = [
     "columns",
     "comparison_rows",
     "distance_rows",
     "middle_rows",
+    "model_pairs",
     "model_rows",
     "run_rows",
 ]
@@ -56,24 +58,23 @@ def columns() -> list[str]:
 
 
 def run_rows(experiment: Experiment) -> list[Row]:
-    """One row a cell: how long it was trained, whether it has solved the trained goals, and how far sampled
+    """One row per run: how long it was trained, whether it has solved the trained goals, and how far sampled
     and exact success are apart.
 
     Returns:
-        rows with model, seed, preset, frames, checkpoint, training_s, trained (success within 500), solved,
-        exact_z: the sampled success less the exact one in standard deviations. Starts are drawn uniformly,
-        so an episode to goal g succeeds with the chance p_g, and the deviation is that of
+        rows with model, seed, run, frames, checkpoint, training_s, cell_s, trained (success within 500),
+        solved, exact_z: the sampled success less the exact one in standard deviations. Starts are drawn
+        uniformly, so an episode to goal g succeeds with the probability p_g, and the deviation is that of
         ``sum_g p_g (1 - p_g) / n_g``. NaN where there is no exact one.
     """
     rows = []
     for label, runs in experiment.runs.items():
         for run in runs:
-            seed = run.seed
-            found = experiment.sums(label, "sampled", [seed])["success_500"]
-            exact = experiment.sums(label, "exact", [seed]).get("success_500")
+            found = experiment.sums(label, "sampled", [run.seed])["success_500"]
+            exact = experiment.sums(label, "exact", [run.seed]).get("success_500")
             over, under = (part[0, experiment.trained].sum() for part in found)
             reached = (over / under).item()
-            row = {"model": label, "seed": seed, "run": f"{run.experiment}/{run.name}"}
+            row = {"model": label, "seed": run.seed, "run": f"{run.experiment}/{run.name}"}
             row |= {key: run.info.get(key) for key in ("frames", "checkpoint", "training_s", "cell_s")}
             row |= {"trained": reached, "solved": reached >= SOLVED}
             rows.append(row | {"exact_z": math.nan if exact is None else _deviations(found, exact)})
@@ -87,50 +88,63 @@ def _deviations(sampled: Sums, exact: Sums) -> float:
     return (gap / variance.sqrt()).item() if variance > 0 else math.nan
 
 
-def model_rows(experiment: Experiment, mode: str, resamples: int = 2000) -> list[Row]:
-    """One row for every model, subset of goals and scene, with both averages over the scenes; the random walk
-    and the shortest path among the models.
+def model_rows(
+    experiment: Experiment,
+    mode: str,
+    resamples: int = 2000,
+    places: Sequence[str] | None = None,
+    metrics: Sequence[str] | None = None,
+) -> list[Row]:
+    """One row per model, subset of goals and scene, with both averages over the scenes; the random walk and
+    the shortest path are among the models.
 
     Args:
-        experiment: the cells.
+        experiment: the runs.
         mode: ``sampled``, ``greedy`` or ``exact``.
         resamples: of the bootstrap over seeds and goals.
+        places: names of scenes and of averages; all by default.
+        metrics: names of metrics; all by default.
 
     Returns:
-        rows with mode, goals, scene, model, seeds, num_goals and the measures that there are.
+        rows with mode, goals, scene, model, seeds, num_goals and the metrics that there are.
     """
-    rows, draws = [], _cached_draws(resamples)
+    rows: list[Row] = []
     names = [scene.name for scene in experiment.scenes.scenes]
     for subset, mask in _subsets(experiment).items():
-        places = [(name, mask & (experiment.scene == index)) for index, name in enumerate(names)]
-        places += [(MEAN_OF_SCENES, mask), (MEAN_OF_STATES, mask)]
-        for place, chosen in places:
+        parts = {name: mask & (experiment.scene == index) for index, name in enumerate(names)}
+        parts |= {MEAN_OF_SCENES: mask, MEAN_OF_STATES: mask}
+        for place in parts if places is None else places:
             head = {"mode": mode, "goals": subset, "scene": place}
-            by_scene = place == MEAN_OF_SCENES
-            rows += [
-                head | row
-                for row in _rows_of(experiment, mode, chosen, draws, by_scene)
-                if bool(chosen.any())
-            ]
+            found = _rows_of(
+                experiment, mode, parts[place], resamples, metrics, by_scene=place == MEAN_OF_SCENES
+            )
+            rows += [head | row for row in found]
     return rows
 
 
-def distance_rows(experiment: Experiment, mode: str, resamples: int = 2000) -> list[Row]:
-    """One row for every model and distance of the goal from the nearest trained one, in actions.
+def distance_rows(
+    experiment: Experiment,
+    mode: str,
+    resamples: int = 2000,
+    models: Sequence[str] | None = None,
+    metrics: Sequence[str] | None = None,
+) -> list[Row]:
+    """One row per model and distance of the goal from the nearest trained one, in actions.
 
     Args:
-        experiment, mode, resamples: see :func:`model_rows`.
+        experiment, mode, resamples, metrics: see :func:`model_rows`.
+        models: labels of models and baselines; all by default.
     """
-    rows, draws = [], _cached_draws(resamples)
+    rows: list[Row] = []
     bins = torch.bucketize(experiment.distance_to_trained, torch.tensor(DISTANCE_BINS), right=True) - 1
     for index in bins[bins >= 0].unique().tolist():
         head = {"mode": mode, "distance": distance_bin(index)}
-        rows += [head | row for row in _rows_of(experiment, mode, bins == index, draws)]
+        rows += [head | row for row in _rows_of(experiment, mode, bins == index, resamples, metrics, models)]
     return rows
 
 
 def middle_rows(experiment: Experiment, mode: str, resamples: int = 2000) -> list[Row]:
-    """The interquartile mean over seeds and scenes, for every model and subset of goals.
+    """The interquartile mean over seeds and scenes, per model and subset of goals.
 
     Args:
         experiment, mode: see :func:`model_rows`.
@@ -150,50 +164,54 @@ def middle_rows(experiment: Experiment, mode: str, resamples: int = 2000) -> lis
     return rows
 
 
-def comparison_rows(experiment: Experiment, mode: str, resamples: int = 2000) -> list[Row]:
-    """Each model against the one before it, the last against the first, and all against the untrained network
-    and the random walk.
-
-    Args:
-        experiment, mode, resamples: see :func:`model_rows`.
-
-    Returns:
-        rows with mode, goals, measure, model, against, seeds (in common), difference (of pairs: same seeds,
-        same goals) and improvement (chance that a run of the model does better in a scene than one of the
-        other; none against the random walk).
-    """
+def model_pairs(experiment: Experiment) -> list[tuple[str, str]]:
+    """Each model and the one before it, the last and the first, and all with the untrained network and the
+    random walk."""
     four = [name for name in MODELS if name in experiment.runs]
     pairs = [*zip(four[1:], four, strict=False)]
     pairs += [(four[-1], four[0])] if len(four) > 2 else []
     extra = [label for label in experiment.runs if label not in (*MODELS, "untrained")]
     pairs += [(label, four[-1]) for label in extra if four]
     pairs += [(name, "untrained") for name in four if "untrained" in experiment.runs]
-    pairs += [(label, RANDOM_WALK) for label in experiment.runs]
-    rows, draws = [], _cached_draws(resamples)
+    return pairs + [(label, RANDOM_WALK) for label in experiment.runs]
+
+
+def comparison_rows(
+    experiment: Experiment,
+    mode: str,
+    resamples: int = 2000,
+    pairs: Sequence[tuple[str, str]] | None = None,
+) -> list[Row]:
+    """One model against another, paired by seed and goal.
+
+    Args:
+        experiment, mode, resamples: see :func:`model_rows`.
+        pairs: labels; :func:`model_pairs` by default.
+
+    Returns:
+        rows with mode, goals, metric, model, against, seeds (in common), difference (of pairs: same seeds,
+        same goals) and improvement (probability that a run of the model does better in a scene than one of
+        the other; none against the random walk).
+    """
+    rows: list[Row] = []
     for subset, mask in _subsets(experiment).items():
-        for label, other in pairs:
+        scene = experiment.scene[mask]
+        for label, other in model_pairs(experiment) if pairs is None else pairs:
             seeds = experiment.seeds(label)
             if other != RANDOM_WALK:
                 seeds = [seed for seed in seeds if seed in experiment.seeds(other)]
             one, two = (experiment.sums(name, mode, seeds) for name in (label, other))
-            for name in COMPARED if seeds else ():
-                if name in one and name in two:
-                    scene = experiment.scene[mask]
-                    first, second = (_masked(sums[name], mask) for sums in (one, two))
-                    drawn = draws(len(seeds), scene)
-                    row: Row = {
-                        "mode": mode,
-                        "goals": subset,
-                        "measure": name,
-                        "model": label,
-                        "against": other,
-                    }
-                    row |= {"seeds": len(seeds)}
-                    row["difference"] = paired_difference(first, second, scene, draws=drawn)
-                    if other != RANDOM_WALK:
-                        better, worse = (_scores(sums[name], experiment.scene, mask) for sums in (one, two))
-                        row["improvement"] = bootstrap_improvement(better, worse, resamples=resamples)
-                    rows.append(row)
+            for name in [name for name in COMPARED if seeds and name in one and name in two]:
+                first, second = (_masked(sums[name], mask) for sums in (one, two))
+                row: Row = {"mode": mode, "goals": subset, "metric": name, "model": label, "against": other}
+                row["seeds"] = len(seeds)
+                row["difference"] = paired_difference(
+                    first, second, scene, draws=_draws(len(seeds), scene, resamples)
+                )
+                if other != RANDOM_WALK:
+                    better, worse = (_scores(sums[name], experiment.scene, mask) for sums in (one, two))
+                    row["improvement"] = bootstrap_improvement(better, worse, resamples=resamples)
+                rows.append(row)
     return rows
 
 
@@ -202,31 +220,35 @@ def _subsets(experiment: Experiment) -> dict[str, Tensor]:
     return {name: mask for name, mask in zip(SUBSETS, masks, strict=True) if bool(mask.any())}
 
 
-def _cached_draws(resamples: int) -> Any:
-    """Draws by number of seeds and goals' scenes, made once each."""
-    kept = lru_cache(maxsize=8)(
-        lambda seeds, scene: make_draws(seeds, torch.tensor(scene), resamples=resamples)
-    )
+def _draws(seeds: int, scene: Tensor, resamples: int) -> Draws:
+    return _kept_draws(seeds, tuple(scene.tolist()), resamples)
 
-    def draws(seeds: int, scene: Tensor) -> Draws:
-        return kept(seeds, tuple(scene.tolist()))
 
-    return draws
+@lru_cache(maxsize=8)
+def _kept_draws(seeds: int, scene: tuple[int, ...], resamples: int) -> Draws:
+    """Made once, for all the tables of these goals."""
+    return make_draws(seeds, torch.tensor(scene), resamples=resamples)
 
 
 def _rows_of(
-    experiment: Experiment, mode: str, mask: Tensor, draws: Any, by_scene: bool = False
+    experiment: Experiment,
+    mode: str,
+    mask: Tensor,
+    resamples: int,
+    metrics: Sequence[str] | None,
+    models: Sequence[str] | None = None,
+    by_scene: bool = False,
 ) -> list[Row]:
     rows, scene = [], experiment.scene[mask]
-    for label in (*experiment.runs, RANDOM_WALK, SHORTEST_PATH):
-        sums = experiment.sums(label, mode) if bool(mask.any()) else {}
+    for label in [*experiment.runs, RANDOM_WALK, SHORTEST_PATH] if bool(mask.any()) else []:
+        sums = experiment.sums(label, mode) if models is None or label in models else {}
         if not sums:
             continue
         seeds = len(sums["success_500"].numerator) if label in experiment.runs else 0
         row: Row = {"model": label, "seeds": seeds or "–", "num_goals": int(mask.sum())}
-        for name, table in sums.items():
-            part = _masked(table, mask)
-            drawn = draws(len(part.numerator), scene)
+        for name in sums if metrics is None else [name for name in metrics if name in sums]:
+            part = _masked(sums[name], mask)
+            drawn = _draws(len(part.numerator), scene, resamples)
             row[name] = bootstrap_mean(part, scene, by_scene=by_scene, draws=drawn)
         rows.append(row)
     return rows

@@ -6,8 +6,8 @@ import torch
 from vusfa.errors import ResultError
 from vusfa.evaluation import Episodes
 from vusfa.evaluation.exact import ExactGoals
-from vusfa.experiments.generalise import unseen_table
 from vusfa.experiments.runs import Run
+from vusfa.report.unseen import unseen_table
 
 
 def cell(seed: int, lengths: list[int]) -> Run:

@@ -12,10 +12,10 @@ import torch
 from vusfa.evaluation import Episodes
 from vusfa.evaluation.exact import ExactGoals
 from vusfa.evaluation.statistics import Estimate
-from vusfa.experiments.experiment import Experiment, read_experiment
-from vusfa.experiments.markdown import flat_rows, markdown
 from vusfa.experiments.runs import Run, write_run
-from vusfa.experiments.tables import (
+from vusfa.report.experiment import Experiment, read_experiment
+from vusfa.report.markdown import flat_rows, markdown
+from vusfa.report.result_tables import (
     comparison_rows,
     distance_rows,
     middle_rows,
@@ -125,13 +125,13 @@ def test_the_middle_half_over_seeds_and_scenes(experiment: Experiment) -> None:
 
 def test_comparisons(experiment: Experiment) -> None:
     rows = comparison_rows(experiment, "sampled", resamples=200)
-    row = find(rows, goals="unseen", measure="success_500", model="usfa", against="gvf")
+    row = find(rows, goals="unseen", metric="success_500", model="usfa", against="gvf")
     assert row["difference"].value == pytest.approx((0.75 + 0.5 + 0.5) / 3)
     assert row["improvement"] == Estimate(1.0, 1.0, 1.0)
-    row = find(rows, goals="trained", measure="success_500", model="usfa", against="gvf")
+    row = find(rows, goals="trained", metric="success_500", model="usfa", against="gvf")
     assert row["difference"] == Estimate(-0.25, -0.5, 0.0)
     assert row["improvement"].value == 0.25  # one of two seeds ties
-    row = find(rows, goals="trained", measure="spl", model="gvf", against="random walk")
+    row = find(rows, goals="trained", metric="spl", model="gvf", against="random walk")
     assert row["difference"].value > 0
     assert "improvement" not in row
 

@@ -6,9 +6,12 @@ import sys
 from pathlib import Path
 
 from vusfa.evaluation.long_table import MEAN_OF_STATES, SUBSETS
-from vusfa.experiments.experiment import read_experiment
-from vusfa.experiments.markdown import flat_rows, markdown
-from vusfa.experiments.tables import (
+from vusfa.experiments.runs import read_runs
+from vusfa.files import check_folder, write_csv
+from vusfa.report.experiment import Experiment, read_experiment
+from vusfa.report.generated import write_documents
+from vusfa.report.markdown import flat_rows, markdown
+from vusfa.report.result_tables import (
     columns,
     comparison_rows,
     distance_rows,
@@ -16,7 +19,7 @@ from vusfa.experiments.tables import (
     model_rows,
     run_rows,
 )
-from vusfa.files import check_folder, write_csv
+from vusfa.report.unseen import unseen_table
 from vusfa.scenes import SceneSet
 from vusfa.training import set_threads
 
@@ -30,6 +33,7 @@ def print_tables(
     *,
     results: Path = Path("results"),
     out: Path | None = None,
+    docs: Path | None = None,
     scenes: list[str] | None = None,
     resamples: int = 2000,
     threads: int = 1,
@@ -37,27 +41,34 @@ def print_tables(
     """Print the tables of experiments that share their episodes, in Markdown and with 95 % intervals.
 
     Intervals are over seeds and goals; the tables are written as CSV, too, unrounded. Nothing is trained and
-    no episode is walked: the numbers come from the episodes in RESULTS.
+    no episode is run: the numbers come from the episodes in RESULTS.
 
     Args:
-        experiments: folders of results, shown together.
+        experiments: folders of results, shown together; or generalise alone.
         results: where they lie.
         out: folder for the CSV files; RESULTS/tables when not given.
+        docs: write the tables that the documentation shows to this folder (docs/generated), and print none.
         scenes: bundled names and files, in order; the bundled rooms that the runs name when not given.
         resamples: of the bootstrap.
         threads: processor threads; more than 1 pays on an idle machine only.
     """
     set_threads(threads)
-    folder = check_folder(out or results / "tables", "out")
-    experiment = read_experiment(results, experiments, SceneSet.open(scenes) if scenes else None)
-    names = ["model", "seeds", "num_goals", *columns()]
+    if docs is not None:
+        for path in write_documents(results, check_folder(docs, "docs")):
+            print(path)
+    elif experiments == ["generalise"]:
+        print(unseen_table(read_runs(results, "generalise")))
+    else:
+        folder = check_folder(out or results / "tables", "out")
+        world = SceneSet.open(scenes) if scenes else None
+        _print(read_experiment(results, experiments, world), folder, resamples)
 
+
+def _print(experiment: Experiment, folder: Path, resamples: int) -> None:
+    names = ["model", "seeds", "num_goals", *columns()]
     runs = run_rows(experiment)
-    show(
-        "Runs",
-        runs,
-        ["model", "seed", "frames", "checkpoint", "training_s", "trained", "solved", "exact_z"],
-    )
+    heads = ["model", "seed", "frames", "checkpoint", "training_s", "trained", "solved", "exact_z"]
+    _show("Runs", runs, heads)
     unsolved = [
         f"{row['model']} of seed {row['seed']} ({100 * row['trained']:.1f} % after {row['frames']:,} frames)"
         for row in runs
@@ -70,27 +81,27 @@ def print_tables(
         found = model_rows(experiment, mode, resamples)
         for subset in SUBSETS:
             rows = [row for row in found if (row["goals"], row["scene"]) == (subset, MEAN_OF_STATES)]
-            show(f"{subset.capitalize()} goals, {words}", rows, names)
+            _show(f"{subset.capitalize()} goals, {words}", rows, names)
         if mode == "sampled":
             for subset in ("unseen", "all"):
                 rows = [row for row in found if row["goals"] == subset]
-                show(f"Scene by scene, {subset} goals, {words}", rows, ["scene", *names])
+                _show(f"Scene by scene, {subset} goals, {words}", rows, ["scene", *names])
         every += found
         far += distance_rows(experiment, mode, resamples)
         middle += middle_rows(experiment, mode, resamples)
         compared += comparison_rows(experiment, mode, resamples)
     drawn = [[row for row in rows if row["mode"] == "sampled"] for rows in (far, middle, compared)]
-    show("By actions from the nearest trained goal, actions drawn", drawn[0], ["distance", *names])
-    show("Interquartile mean over seeds and scenes, actions drawn", drawn[1], ["goals", *names])
-    heads = ["goals", "measure", "model", "against", "seeds", "difference", "improvement"]
-    show("Paired differences and chances of improvement, both in %, actions drawn", drawn[2], heads)
+    _show("By actions from the nearest trained goal, actions drawn", drawn[0], ["distance", *names])
+    _show("Interquartile mean over seeds and scenes, actions drawn", drawn[1], ["goals", *names])
+    heads = ["goals", "metric", "model", "against", "seeds", "difference", "improvement"]
+    _show("Paired differences and probabilities of improvement, both in %, actions drawn", drawn[2], heads)
     for name, rows in (
         ("runs", runs), ("models", every), ("distance", far), ("middle", middle), ("compared", compared),
     ):  # fmt: skip
         print(write_csv(folder / f"{name}.csv", flat_rows(rows)), file=sys.stderr)
 
 
-def show(title: str, rows: list[dict[str, object]], columns: list[str]) -> None:
-    """Print a table with its title; nothing for no rows."""
+def _show(title: str, rows: list[dict[str, object]], columns: list[str]) -> None:
+    """A table with its title; nothing for no rows."""
     if rows:
         print(f"### {title}\n\n{markdown(rows, columns)}\n")
