@@ -9,7 +9,7 @@ the released code of VUSFA.)
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -25,6 +25,8 @@ __all__ = [
     "Transition",
     "check_actions",
     "push_frame",
+    "rows_where",
+    "stand_still",
     "start_history",
     "step",
 ]
@@ -181,3 +183,17 @@ def step(
         truncated=truncated,
         done=terminated | truncated,
     )
+
+
+def rows_where(rows: Tensor, new: Tensor, old: Tensor) -> Tensor:
+    """The entry ``new`` in some rows (*B,) bool, ``old`` in the others."""
+    return torch.where(rows.unsqueeze(-1) if new.ndim > rows.ndim else rows, new, old)
+
+
+def stand_still(after: dict[str, Tensor], before: Any, stepping: Tensor) -> dict[str, Tensor]:
+    """Undo the step of the rows that are not ``stepping`` (*B,) bool; what was not there before is 0."""
+    result = {}
+    for key, value in after.items():
+        old = None if key == "reward" else before.get(key, None)
+        result[key] = rows_where(stepping, value, torch.zeros_like(value) if old is None else old)
+    return result

@@ -30,7 +30,7 @@ class TargetNavEnv(SceneEnv):
 
     Args:
         scenes: the world.
-        goals: which states are goals, see :mod:`vusfa.envs.goals`. Those of several scenes may be mixed.
+        goals: which states are goals, see :mod:`vusfa.envs.goals`.
         batch_size: any shape; ``[]`` is a single agent.
         history: frames that ``state_id`` reaches back, this one included; at reset the first is repeated.
         max_steps: steps after which an episode is truncated.
@@ -38,9 +38,8 @@ class TargetNavEnv(SceneEnv):
             ``(first_goal + i) % G`` and keeps it, as the paper's threads do; "episode" draws one for each
             episode, uniformly over the scenes that have goals and then over the scene's goals.
         first_goal: which goal the first row gets, for workers that share one list of fixed goals.
-        goal_reward: what reaching the goal earns.
-        step_reward: what any other step earns.
-        collision_reward: what a blocked step earns; None for the same as any step. The paper's raw values are
+        goal_reward, step_reward: reward of reaching the goal, and of any other step.
+        collision_reward: reward of a blocked step; None for that of any step. The paper's raw values are
             ``goal_reward=10, step_reward=-0.01, collision_reward=-0.1``.
         seed: where the environment's own random generator begins. None begins somewhere else each time,
             whatever ``torch.manual_seed`` says, so that workers never repeat one another.
@@ -133,8 +132,6 @@ class TargetNavEnv(SceneEnv):
             f" batch_size={list(self.batch_size)}, {values}, device={str(self.device)!r})"
         )
 
-    # -- the two halves of an episode ------------------------------------------------------------------------
-
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         world = self._world
         state, action = (
@@ -159,7 +156,7 @@ class TargetNavEnv(SceneEnv):
         entries = {**state, **after._asdict()}
         stepping = tensordict.get("_step", None)
         if stepping is not None:
-            entries = _leave_standing(entries, tensordict, stepping.reshape(self.batch_size))
+            entries = dynamics.stand_still(entries, tensordict, stepping.reshape(self.batch_size))
         self._show(after.state_id, state["goal_id"])
         return self._wrap(entries)
 
@@ -225,8 +222,6 @@ class TargetNavEnv(SceneEnv):
         self._show(entries["state_id"], entries["goal_id"])
         return entries
 
-    # -- putting agents where one wants them -----------------------------------------------------------------
-
     def set_state(self, state: Tensor | int, goal: Tensor | int) -> TensorDictBase:
         """Begin an episode in every row at a state of one's choice, towards a goal of one's choice.
 
@@ -284,7 +279,7 @@ class TargetNavEnv(SceneEnv):
             entries["shortest_path"] = tensordict.get("shortest_path", path).clone()
         if over.any():
             fresh = self._fresh()
-            entries = {key: _rows_where(over, fresh[key], value) for key, value in entries.items()}
+            entries = {key: dynamics.rows_where(over, fresh[key], value) for key, value in entries.items()}
         return entries
 
 
@@ -298,19 +293,3 @@ def _check_arguments(*, history: int, max_steps: int, goal_sampling: str, first_
             raise ConfigError(f"{name} is {value}; it must be at least {least}")
     if goal_sampling not in ("fixed", "episode"):
         raise ConfigError(f"goal_sampling is {goal_sampling!r}; it is 'fixed' or 'episode'")
-
-
-def _leave_standing(
-    entries: dict[str, Tensor], before: TensorDictBase, stepping: Tensor
-) -> dict[str, Tensor]:
-    """Undo the step of the rows that are not ``stepping`` (*B,); their reward is 0."""
-    result = {}
-    for key, value in entries.items():
-        old = before.get(key, None)  # what nobody reads back may be missing
-        result[key] = _rows_where(stepping, value, torch.zeros_like(value) if old is None else old)
-    return result
-
-
-def _rows_where(rows: Tensor, new: Tensor, old: Tensor) -> Tensor:
-    """The entry ``new`` in some rows (*B,), ``old`` in the others."""
-    return torch.where(rows.unsqueeze(-1) if new.ndim > rows.ndim else rows, new, old)
