@@ -1,11 +1,4 @@
-"""The four models, built from one table of differences.
-
->>> from vusfa.modules import make_agent
->>> from vusfa.scenes import SceneSet
->>> scenes = SceneSet.bundled(["bathroom"])
->>> agent = make_agent(model="vusfa", architecture="controlled", scenes=scenes)
->>> actor, critic = agent.get_policy_operator(), agent.get_value_operator()
-"""
+"""Agents: the layers of one model, and the actor and critic made of them."""
 
 from __future__ import annotations
 
@@ -291,6 +284,8 @@ class Remembering(_SaysWhatIsMissing, LSTMModule):
 def _plain(config: AgentConfig, scenes: Any) -> dict[str, Any]:
     plain = dataclasses.asdict(config)
     plain["picture_size"] = list(config.picture_size)
+    if config.deduplicate:  # a way to compute, not part of what was learned
+        del plain["deduplicate"]
     plain["scenes"] = list(scenes.names)
     plain["fingerprint"] = scenes.fingerprint
     plain["num_actions"] = scenes.num_actions

@@ -260,7 +260,7 @@ class SiameseEncoder(nn.Module):
         goal_first = (self.goal_branch or self.branch).first
         goal_sums = goal_first(goals) if goals.dim() == states.dim() else goal_first.repeated(goals)
         state_sums = self.branch.first(states)
-        return Rows(state_sums.flatten(0, -2)), Rows(goal_sums.flatten(0, -2))
+        return tuple(Rows(sums.reshape(-1, sums.shape[-1])) for sums in (state_sums, goal_sums))  # type: ignore[return-value]
 
     def _newest(self, frames: Tensor, key: str) -> Tensor:
         """Features (\\*B, H, F) of the last H frames."""
