@@ -4,8 +4,9 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed-dev
 RENDER := $(VENV)/.installed-render
+DOCS := $(VENV)/.installed-docs
 
-.PHONY: demo test lint typecheck clean help
+.PHONY: demo docs test lint typecheck clean help
 
 help:  ## list the targets
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/'
@@ -23,8 +24,16 @@ $(RENDER): $(STAMP)
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[dev,render]'
 	touch $@
 
+# What the site is built with: Sphinx, MyST-NB and the theme.
+$(DOCS): $(STAMP)
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[dev,docs]'
+	touch $@
+
 demo: $(STAMP)  ## train VUSFA in the bundled bathroom, evaluate it, film one walk
 	$(BIN)/python recipes/demo.py
+
+docs: $(DOCS)  ## build the documentation site into docs/_build/html; a warning is an error, tutorials are executed
+	$(BIN)/python -m sphinx -W --keep-going -q -b html docs docs/_build/html
 
 lint: $(STAMP)  ## ruff: rules and format
 	$(BIN)/ruff check .
@@ -37,4 +46,4 @@ test: lint typecheck $(RENDER)  ## lint, type-check, all tests and doctests
 	$(BIN)/python -m pytest -n 2 -q
 
 clean:  ## remove the virtual environment and everything built
-	rm -rf $(VENV) build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	rm -rf $(VENV) build dist docs/_build docs/api *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis

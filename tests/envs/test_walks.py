@@ -54,7 +54,7 @@ class Agent:
             "scene_id": self.task.scene_of[self.goal],
             "collided": [self.collided],
             "shortest_path": [self.shortest],
-            "elapsed_steps": [self.clock],
+            "step_count": [self.clock],
             "terminated": [self.terminated],
             "truncated": [self.truncated],
             "done": [self.terminated or self.truncated],
@@ -159,7 +159,6 @@ def test_every_step_reset_mask_time_out_and_collision(data: st.DataObject) -> No
         step_reward=rewards[1],
         collision_reward=rewards[2],
         seed=data.draw(st.integers(0, 2**32)),
-        shortest_path=True,
     )
     if data.draw(st.booleans(), label="transformed"):
         env = TransformedEnv(env)

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from vusfa.modules.linear import SceneLinear
-from vusfa.modules.precision import full_precision, padded_linear
+from vusfa.modules.precision import padded_linear
 from vusfa.modules.rows import RowScenes
 
 __all__ = ["RewardHead", "SuccessorHead", "SuccessorValue", "ValueHead"]
@@ -38,8 +38,7 @@ class SuccessorHead(nn.Module):
 
     def forward(self, hidden: Tensor, scene_id: RowScenes) -> Tensor:
         """(\\*B, hidden_size) with scene indices (\\*B,) to (\\*B, E) float32."""
-        # nobody else's: scaled where it lies
-        successor = full_precision(self.linear(hidden, scene_id), self.linear.weight)
+        successor = self.linear(hidden, scene_id).float()  # nobody else's: scaled where it lies
         return successor if self.scale == 1.0 else successor.mul_(self.scale)
 
 
@@ -66,8 +65,7 @@ class RewardHead(nn.Module):
     def forward(self, goal: Tensor) -> Tensor:
         """Goal embedding, or a sample of it, (\\*B, E) to (\\*B, E) float32."""
         first = functional.relu(padded_linear(goal, self.first.weight, self.first.bias))
-        weights = padded_linear(first, self.last.weight, self.last.bias)
-        return self.scale * full_precision(weights, self.last.weight)
+        return self.scale * padded_linear(first, self.last.weight, self.last.bias).float()
 
 
 class SuccessorValue(nn.Module):
@@ -97,4 +95,4 @@ class ValueHead(nn.Module):
 
     def forward(self, hidden: Tensor, scene_id: RowScenes) -> Tensor:
         """(\\*B, hidden_size) with scene indices (\\*B,) to (\\*B, 1) float32."""
-        return full_precision(self.linear(hidden, scene_id), self.linear.weight)
+        return self.linear(hidden, scene_id).float()

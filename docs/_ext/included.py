@@ -1,0 +1,27 @@
+"""Files that a page includes: a line that is nothing but a link to one becomes the file's text.
+
+On a plain view of the Markdown, as on GitHub, it stays the link. This holds for the tables in docs/generated
+and for the Markdown files beside docs.
+"""
+
+from __future__ import annotations
+
+import re
+from typing import Any
+
+from sphinx.application import Sphinx
+
+__all__ = ["include_files", "setup"]
+
+_LINK = re.compile(r"^\[[^\]\n]+\]\((generated/[\w-]+\.md|\.\./[A-Z]+\.md)\)$", flags=re.MULTILINE)
+
+
+def include_files(app: Sphinx, page: str, source: list[str]) -> None:
+    """Replace the links of one page, in place."""
+    source[0] = _LINK.sub(r"```{include} \1\n:relative-docs: docs/\n```", source[0])
+
+
+def setup(app: Sphinx) -> dict[str, Any]:
+    """Register the replacing."""
+    app.connect("source-read", include_files)
+    return {"parallel_read_safe": True, "parallel_write_safe": True}
