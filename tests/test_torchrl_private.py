@@ -83,9 +83,9 @@ def test_torchrl_asks_whether_a_reset_resumes_episodes() -> None:
     assert EnvBase._supports_set_state is False
     assert StatelessEnv._supports_set_state is True
     env = TargetNavEnv(SceneSet.bundled(["bathroom"]), [73], [1], seed=0)
-    resumed = env.reset(env.set_state(5, 73).set("step_count", torch.tensor([[9]])), set_state=True)
+    resumed = env.reset(env.set_state(5, 73).set("elapsed_steps", torch.tensor([[9]])), set_state=True)
     assert resumed["state_id"][0, -1] == 5
-    assert resumed["step_count"].item() == 9
+    assert resumed["elapsed_steps"].item() == 9
 
 
 @pytest.mark.parametrize("room", ["algorithms", "conf", "envs", "scenes", "sources", "training"])

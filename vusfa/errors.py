@@ -7,7 +7,15 @@ them.
 
 from __future__ import annotations
 
-__all__ = ["CameraError", "CheckpointError", "ConfigError", "GoalError", "SceneError", "VusfaError"]
+__all__ = [
+    "ActionError",
+    "CameraError",
+    "CheckpointError",
+    "ConfigError",
+    "GoalError",
+    "SceneError",
+    "VusfaError",
+]
 
 
 class VusfaError(ValueError):
@@ -34,6 +42,10 @@ class CheckpointError(VusfaError):
 
 class CameraError(VusfaError):
     """A camera, stream or folder of pictures that cannot be read."""
+
+
+class ActionError(VusfaError, IndexError):
+    """An action that does not exist, or none at all."""
 
 
 class ConfigError(VusfaError):

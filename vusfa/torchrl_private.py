@@ -48,6 +48,8 @@ def carrier(collector: Collector) -> TensorDict:
 def put_carrier(collector: Collector, content: dict[str, Any]) -> None:
     """Has a collector step on from what :func:`carrier` gave, as nested dictionaries of tensors."""
     before = collector._carrier
+    if "step_count" in content and "elapsed_steps" in before:  # its name in checkpoints of version 0.1
+        content = {("elapsed_steps" if key == "step_count" else key): value for key, value in content.items()}
     collector._carrier = TensorDict(content, batch_size=before.batch_size, device=before.device)
 
 

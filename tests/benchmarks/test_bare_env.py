@@ -26,7 +26,7 @@ def test_steps_are_those_of_our_environment(history: int):
                 "state_id": bare.state,
                 "goal_id": bare.goal,
                 "scene_id": bare.scene,
-                "step_count": bare.clock.unsqueeze(-1),
+                "elapsed_steps": bare.clock.unsqueeze(-1),
                 "shortest_path": torch.ones(64, 1, dtype=torch.int64),
                 "action": action,
             },

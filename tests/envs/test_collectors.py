@@ -37,7 +37,7 @@ def check_continuity(data: TensorDictBase, scenes: SceneSet) -> None:
     assert torch.equal(data["next", "state_id"][..., -1], moved)
     ended = data["next", "done"][..., :-1, :]
     assert ended.any()
-    assert torch.equal(data["step_count"][..., 1:, :], data["next", "step_count"][..., :-1, :] * ~ended)
+    assert torch.equal(data["elapsed_steps"][..., 1:, :], data["next", "elapsed_steps"][..., :-1, :] * ~ended)
     same = torch.where(ended, data["state_id"][..., 1:, :], data["next", "state_id"][..., :-1, :])
     assert torch.equal(data["state_id"][..., 1:, :], same)
 

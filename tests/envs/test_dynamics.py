@@ -23,7 +23,7 @@ def walk(
         max_steps,
         state_id=torch.tensor([state, state]),
         goal_id=torch.tensor(goal),
-        step_count=torch.tensor([clock]),
+        elapsed_steps=torch.tensor([clock]),
         action=torch.tensor(action),
     )
 
@@ -32,7 +32,7 @@ def test_a_move_pushes_a_frame_and_costs_a_little() -> None:
     after = walk(0, goal=2, action=0)
     assert after.state_id.tolist() == [0, 1]
     assert after.reward.tolist() == [pytest.approx(-0.01)]
-    assert after.step_count.tolist() == [1]
+    assert after.elapsed_steps.tolist() == [1]
     assert [x.item() for x in (after.collided, after.terminated, after.truncated, after.done)] == [False] * 4
 
 
@@ -40,7 +40,7 @@ def test_a_blocked_move_stays_and_pushes_a_frame_all_the_same() -> None:
     after = walk(2, goal=0, action=0)
     assert after.state_id.tolist() == [2, 2]
     assert after.collided.item() is True
-    assert after.step_count.item() == 1
+    assert after.elapsed_steps.item() == 1
     assert after.reward.item() == pytest.approx(-0.01)
 
 
@@ -95,7 +95,7 @@ def test_nothing_is_written_in_place() -> None:
     before = {
         "state_id": torch.tensor([[0, 1]]),
         "goal_id": torch.tensor([2]),
-        "step_count": torch.tensor([[3]]),
+        "elapsed_steps": torch.tensor([[3]]),
         "action": torch.tensor([0]),
     }
     copies = {key: value.clone() for key, value in before.items()}

@@ -180,7 +180,7 @@ def test_bad_arguments_name_themselves(scenes: SceneSet) -> None:
     with pytest.raises(ConfigError, match="render_mode is 'human'"):
         vusfa.envs.gym.TargetNavGym(scenes, "all", render_mode="human")
     env = gymnasium.make(ENV_ID, scenes=scenes, goals="all")
-    with pytest.raises(ConfigError, match="only 'state'; give 'state' and 'goal'"):
+    with pytest.raises(ConfigError, match=r"are \['state'\]; give 'state' and 'goal'"):
         env.reset(options={"state": 3})
     envs = gymnasium.make_vec(ENV_ID, 2, "vector_entry_point", scenes=scenes, goals="all")
     with pytest.raises(ConfigError, match="3 seeds for 2 environments"):

@@ -55,7 +55,7 @@ def test_specs(scenes: SceneSet, batch_size: tuple[int, ...], goal_sampling: str
 
 
 def test_keys_shapes_and_types(scenes: SceneSet) -> None:
-    env = TargetNavEnv(scenes, "all", batch_size=[2, 3], history=5)
+    env = TargetNavEnv(scenes, "all", batch_size=[2, 3], history=5, shortest_path=True)
     data = env.rollout(4, break_when_any_done=False)
     following = data["next"]
     shared = {
@@ -64,7 +64,7 @@ def test_keys_shapes_and_types(scenes: SceneSet) -> None:
         "scene_id": ((2, 3, 4), torch.int64),
         "collided": ((2, 3, 4, 1), torch.bool),
         "shortest_path": ((2, 3, 4, 1), torch.int64),
-        "step_count": ((2, 3, 4, 1), torch.int64),
+        "elapsed_steps": ((2, 3, 4, 1), torch.int64),
         "done": ((2, 3, 4, 1), torch.bool),
         "terminated": ((2, 3, 4, 1), torch.bool),
         "truncated": ((2, 3, 4, 1), torch.bool),
@@ -103,7 +103,7 @@ def test_episode_goals_are_uniform_over_scenes(scenes: SceneSet) -> None:
 
 
 def test_starts_are_uniform_and_their_paths_right(scenes: SceneSet) -> None:
-    env = TargetNavEnv(scenes, [3], batch_size=[15_000], seed=1)
+    env = TargetNavEnv(scenes, [3], batch_size=[15_000], seed=1, shortest_path=True)
     data = env.reset()
     start = data["state_id"][:, -1]
     counts = start.bincount(minlength=16)
@@ -114,13 +114,13 @@ def test_starts_are_uniform_and_their_paths_right(scenes: SceneSet) -> None:
 
 
 def test_set_state(scenes: SceneSet) -> None:
-    env = TargetNavEnv(scenes, [3], batch_size=[2], seed=0)
+    env = TargetNavEnv(scenes, [3], batch_size=[2], seed=0, shortest_path=True)
     data = env.set_state(torch.tensor([0, 16]), torch.tensor([2, 17]))
     assert data["state_id"].tolist() == [[0] * 4, [16] * 4]
     assert data["goal_id"].tolist() == [2, 17]
     assert data["scene_id"].tolist() == [0, 1]
     assert data["shortest_path"].tolist() == [[2], [1]]
-    assert data["step_count"].tolist() == [[0], [0]]
+    assert data["elapsed_steps"].tolist() == [[0], [0]]
     assert not data["done"].any()
     after = env.step(data.set("action", torch.tensor([1, 1])))["next"]
     assert after["terminated"].tolist() == [[False], [True]]
@@ -153,14 +153,14 @@ def test_set_state_names_the_culprit(scenes: SceneSet, state: int, goal: int, me
 
 
 def test_reset_with_set_state_takes_up_what_the_tensordict_describes(scenes: SceneSet) -> None:
-    env = TargetNavEnv(scenes, "all", batch_size=[5], seed=0)
+    env = TargetNavEnv(scenes, "all", batch_size=[5], seed=0, shortest_path=True)
     walked = env.rollout(6, break_when_any_done=False)
     middle = step_mdp(walked[:, 3])
     alive = ~middle["done"].squeeze(-1)
-    state = middle.select("state_id", "goal_id", "step_count", "shortest_path")[alive]
-    other = TargetNavEnv(scenes, [0], batch_size=[int(alive.sum())])
+    state = middle.select("state_id", "goal_id", "elapsed_steps", "shortest_path")[alive]
+    other = TargetNavEnv(scenes, [0], batch_size=[int(alive.sum())], shortest_path=True)
     resumed = other.reset(state, set_state=True)
-    for key in ("state_id", "goal_id", "scene_id", "step_count", "shortest_path"):
+    for key in ("state_id", "goal_id", "scene_id", "elapsed_steps", "shortest_path"):
         assert torch.equal(resumed[key], middle[key][alive])
 
 
@@ -303,7 +303,7 @@ def test_rows_without_a_step_stand_still(scenes: SceneSet) -> None:
     data["_step"] = torch.tensor([True, False, True])
     after = env.step(data)["next"]
     assert after["state_id"][:, -1].tolist() == [1, 0, 3]
-    assert after["step_count"].flatten().tolist() == [1, 0, 1]
+    assert after["elapsed_steps"].flatten().tolist() == [1, 0, 1]
     assert after["reward"].flatten().tolist() == [pytest.approx(-0.01), 0.0, 1.0]
     assert after["done"].flatten().tolist() == [False, False, True]
 
@@ -317,10 +317,10 @@ def test_rollout_until_all_are_done(scenes: SceneSet) -> None:
 
 def test_transforms_count_and_sum_the_same(scenes: SceneSet) -> None:
     base = TargetNavEnv(scenes, "all", batch_size=[6], max_steps=5, seed=0)
-    env = TransformedEnv(base, Compose(StepCounter(step_count_key="counted"), RewardSum(), InitTracker()))
+    env = TransformedEnv(base, Compose(StepCounter(), RewardSum(), InitTracker()))
     data = random_walk(env, 30)
-    assert torch.equal(data["next", "counted"], data["next", "step_count"])
-    assert torch.equal(data["is_init"], data["step_count"] == 0)
+    assert torch.equal(data["next", "step_count"], data["next", "elapsed_steps"])
+    assert torch.equal(data["is_init"], data["elapsed_steps"] == 0)
     total = torch.zeros(6, 1)
     for step in range(30):
         total = torch.where(data["is_init"][:, step], 0.0, total) + data["next", "reward"][:, step]

@@ -54,7 +54,7 @@ class Agent:
             "scene_id": self.task.scene_of[self.goal],
             "collided": [self.collided],
             "shortest_path": [self.shortest],
-            "step_count": [self.clock],
+            "elapsed_steps": [self.clock],
             "terminated": [self.terminated],
             "truncated": [self.truncated],
             "done": [self.terminated or self.truncated],
@@ -159,6 +159,7 @@ def test_every_step_reset_mask_time_out_and_collision(data: st.DataObject) -> No
         step_reward=rewards[1],
         collision_reward=rewards[2],
         seed=data.draw(st.integers(0, 2**32)),
+        shortest_path=True,
     )
     if data.draw(st.booleans(), label="transformed"):
         env = TransformedEnv(env)

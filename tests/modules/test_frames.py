@@ -49,13 +49,6 @@ class TestFeatureFrames:
             assert torch.equal(frames.lookup(None), frames.table.bfloat16())
         assert frames.lookup(None) is frames.table
 
-    def test_a_constant_feature_becomes_nothing(self) -> None:
-        features = torch.rand(5, 1, 3)
-        features[..., 1] = 0.7
-        table = FeatureFrames(features, normalize=True).lookup(None)
-        assert table.isfinite().all()
-        assert table[:, 1].abs().max() < 1e-3
-
 
 class TestPictureFrames:
     def test_lookup_is_encoding_of_the_pictures(self, filmed: SceneSet) -> None:

@@ -153,7 +153,7 @@ class TestPlainTask:
                 optimiser.step()
             ended = rollout["next", "done"]
             # a batch in which no episode ends is one of long episodes
-            length = rollout["next", "step_count"][ended].double().mean().nan_to_num(200.0)
+            length = rollout["next", "elapsed_steps"][ended].double().mean().nan_to_num(200.0)
             if "successor_target" in targets:
                 losses["scale"] = targets["successor_target"].square().mean()
             history.append(losses.detach().set("length", length))

@@ -29,7 +29,7 @@ def in_python(rooms: SceneSet, batches: list[TensorDict]) -> dict[str, float]:
             if not row["done"]:
                 continue
             scene = rooms.names[int(row["scene_id"])]
-            one = (bool(row["terminated"]), int(row["step_count"]), int(row["shortest_path"]))
+            one = (bool(row["terminated"]), int(row["elapsed_steps"]), int(row["shortest_path"]))
             for key in ("", f"scene/{scene}/", f"goal/{scene}/{int(rooms.local_id(row['goal_id']))}/"):
                 ended.setdefault(key, []).append(one)
     result: dict[str, float] = {"collisions": collisions / frames, "episodes": len(ended[""])}
@@ -43,7 +43,9 @@ def in_python(rooms: SceneSet, batches: list[TensorDict]) -> dict[str, float]:
 
 
 def test_against_a_plain_loop(rooms: SceneSet):
-    env = TargetNavEnv(rooms, goals=[3, 20, 9, 17], batch_size=[2, 4], max_steps=9, seed=0)
+    env = TargetNavEnv(
+        rooms, goals=[3, 20, 9, 17], batch_size=[2, 4], max_steps=9, seed=0, shortest_path=True
+    )
     torch.manual_seed(0)
     batches = [env.rollout(25, break_when_any_done=False) for _ in range(3)]
     meter = EpisodeMeter(rooms, env.goals)
@@ -64,7 +66,7 @@ def test_against_a_plain_loop(rooms: SceneSet):
 
 
 def test_a_flush_starts_over_with_the_same_keys(rooms: SceneSet):
-    env = TargetNavEnv(rooms, goals=[3], batch_size=[4], max_steps=3, seed=0)
+    env = TargetNavEnv(rooms, goals=[3], batch_size=[4], max_steps=3, seed=0, shortest_path=True)
     meter = EpisodeMeter(rooms, env.goals)
     meter.update(env.rollout(6, break_when_any_done=False))
     first, second = meter.flush(), meter.flush()
@@ -74,7 +76,7 @@ def test_a_flush_starts_over_with_the_same_keys(rooms: SceneSet):
 
 
 def test_meters_go_on_from_their_state(rooms: SceneSet):
-    env = TargetNavEnv(rooms, goals=[3, 20], batch_size=[4], max_steps=5, seed=0)
+    env = TargetNavEnv(rooms, goals=[3, 20], batch_size=[4], max_steps=5, seed=0, shortest_path=True)
     one, two = (env.rollout(9, break_when_any_done=False) for _ in range(2))
     whole, first, second = (EpisodeMeter(rooms, env.goals) for _ in range(3))
     for batch in (one, two):

@@ -9,10 +9,12 @@ the released code of VUSFA.)
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
+
+from vusfa.errors import ActionError
 
 __all__ = [
     "GOAL_REWARD",
@@ -21,7 +23,10 @@ __all__ = [
     "STEP_REWARD",
     "Rewards",
     "Transition",
+    "check_actions",
     "push_frame",
+    "rows_where",
+    "stand_still",
     "start_history",
     "step",
 ]
@@ -64,7 +69,7 @@ class Transition(NamedTuple):
         state_id: (*B, H) int64, oldest first; ``[..., -1]`` is where the agent now is.
         reward: (*B, 1) float32.
         collided: (*B, 1) bool, the move was blocked and the agent stayed.
-        step_count: (*B, 1) int64, steps since the episode began, this one included.
+        elapsed_steps: (*B, 1) int64, steps since the episode began, this one included.
         terminated: (*B, 1) bool, the agent is at its goal.
         truncated: (*B, 1) bool, the time is up (whether or not the goal was reached with the last step).
         done: (*B, 1) bool, either of the two.
@@ -73,7 +78,7 @@ class Transition(NamedTuple):
     state_id: Tensor
     reward: Tensor
     collided: Tensor
-    step_count: Tensor
+    elapsed_steps: Tensor
     terminated: Tensor
     truncated: Tensor
     done: Tensor
@@ -98,6 +103,32 @@ def push_frame(state_id: Tensor, state: Tensor) -> Tensor:
     return torch.cat([state_id[..., 1:], state.unsqueeze(-1)], -1)
 
 
+def check_actions(action: Tensor, num_actions: int) -> Tensor:
+    """Return actions of any integer type and shape as int64.
+
+    Raises:
+        ActionError: they are of another type, or outside 0..A-1. Indexing alone would take -1 for the last.
+
+    >>> check_actions(torch.tensor([0, -1]), 4)
+    Traceback (most recent call last):
+    ...
+    vusfa.errors.ActionError: action -1 does not exist; give whole numbers 0..3
+    """
+    if action.dtype != torch.int64:
+        if action.dtype == torch.bool or action.is_floating_point() or action.is_complex():
+            raise ActionError(
+                f"actions are {action.dtype}; give whole numbers 0..{num_actions - 1}, as int64"
+            )
+        action = action.to(torch.int64)
+    if torch.compiler.is_compiling() or not action.numel():
+        return action
+    low, high = (int(value) for value in action.aminmax())
+    if low < 0 or high >= num_actions:
+        wrong = low if low < 0 else high
+        raise ActionError(f"action {wrong} does not exist; give whole numbers 0..{num_actions - 1}")
+    return action
+
+
 def step(
     successor: Tensor,
     blocked: Tensor,
@@ -105,7 +136,7 @@ def step(
     max_steps: int,
     state_id: Tensor,
     goal_id: Tensor,
-    step_count: Tensor,
+    elapsed_steps: Tensor,
     action: Tensor,
 ) -> Transition:
     """Move every agent by one action. Nothing is written in place, nothing is drawn at random.
@@ -117,14 +148,14 @@ def step(
         max_steps: steps after which an episode is truncated.
         state_id: (*B, H) int64, oldest first.
         goal_id: (*B,) int64.
-        step_count: (*B, 1) int64, steps since the episode began.
+        elapsed_steps: (*B, 1) int64, steps since the episode began.
         action: (*B,) int64 in 0..A-1.
 
     Returns:
         The :class:`Transition`.
 
     Raises:
-        IndexError: an action or a state is out of range.
+        ActionError: an action is no whole number in 0..A-1 (an IndexError; not looked at while compiling).
 
     >>> line = torch.tensor([[1, 0], [2, 0], [2, 1]])  # right, left
     >>> walls = torch.tensor([[False, True], [False, False], [True, False]])
@@ -133,12 +164,13 @@ def step(
     >>> end.state_id.tolist(), end.reward.item(), end.terminated.item(), end.truncated.item()
     ([[1, 2]], 1.0, True, True)
     """
+    action = check_actions(action, successor.shape[-1])
     current = state_id[..., -1]
     state = successor[current, action]
     collided = blocked[current, action].unsqueeze(-1)
     terminated = (state == goal_id).unsqueeze(-1)
-    step_count = step_count + 1
-    truncated = step_count >= max_steps
+    elapsed_steps = elapsed_steps + 1
+    truncated = elapsed_steps >= max_steps
     otherwise = (
         rewards.step if rewards.collision is None else torch.where(collided, rewards.collision, rewards.step)
     )
@@ -146,8 +178,22 @@ def step(
         state_id=push_frame(state_id, state),
         reward=torch.where(terminated, rewards.goal, otherwise),
         collided=collided,
-        step_count=step_count,
+        elapsed_steps=elapsed_steps,
         terminated=terminated,
         truncated=truncated,
         done=terminated | truncated,
     )
+
+
+def rows_where(rows: Tensor, new: Tensor, old: Tensor) -> Tensor:
+    """The entry ``new`` in some rows (*B,) bool, ``old`` in the others."""
+    return torch.where(rows.unsqueeze(-1) if new.ndim > rows.ndim else rows, new, old)
+
+
+def stand_still(after: dict[str, Tensor], before: Any, stepping: Tensor) -> dict[str, Tensor]:
+    """Undo the step of the rows that are not ``stepping`` (*B,) bool; what was not there before is 0."""
+    result = {}
+    for key, value in after.items():
+        old = None if key == "reward" else before.get(key, None)
+        result[key] = rows_where(stepping, value, torch.zeros_like(value) if old is None else old)
+    return result

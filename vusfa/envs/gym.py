@@ -18,7 +18,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
 from vusfa.envs.goals import GoalSpec
-from vusfa.envs.gym_task import GymTask, Observation, Scenes
+from vusfa.envs.gym_task import GymTask, Observation, Scenes, TellsLimit
 from vusfa.errors import ConfigError
 
 __all__ = ["ENV_ID", "TargetNavGym", "TargetNavVector", "register"]
@@ -41,7 +41,7 @@ def register() -> None:
         )
 
 
-class TargetNavGym(gymnasium.Env[Observation, np.int64]):
+class TargetNavGym(TellsLimit, gymnasium.Env[Observation, np.int64]):
     """Walk to the place where a picture was taken, one agent.
 
     Args:
@@ -113,12 +113,18 @@ class TargetNavGym(gymnasium.Env[Observation, np.int64]):
         return {key: value[0].item() for key, value in self._task.info().items()}
 
 
-class TargetNavVector(VectorEnv[Observation, np.ndarray, np.ndarray]):
+class TargetNavVector(TellsLimit, VectorEnv[Observation, np.ndarray, np.ndarray]):
     """Walk to the place where a picture was taken, many agents in one tensor operation each.
 
-    Autoreset is NEXT_STEP, Gymnasium's default: the step after an episode's end ignores the action, begins
-    the next episode, and earns 0. Arguments as those of :class:`TargetNavGym`; with ``goal_sampling="fixed"``
-    row i keeps goal ``i % G``.
+    Arguments are those of :class:`TargetNavGym`; with ``goal_sampling="fixed"`` row i keeps goal ``i % G``.
+    Further ones:
+
+    Args:
+        num_envs: rows.
+        autoreset_mode: "NextStep", Gymnasium's default: the step after an episode's end ignores the action,
+            begins the next episode, and earns 0. Or "Disabled": ended rows wait for ``reset`` with a
+            ``reset_mask``, as TorchRL's ``GymWrapper`` does it.
+        max_episode_steps: another name of ``max_steps``, as Gymnasium passes it on from a spec.
 
     >>> envs = gymnasium.make_vec("vusfa/TargetNav-v0", 8, "vector_entry_point", scenes="bathroom")
     >>> envs.reset(seed=0)[0]["state_id"].shape, envs.metadata["autoreset_mode"]
@@ -140,8 +146,17 @@ class TargetNavVector(VectorEnv[Observation, np.ndarray, np.ndarray]):
         render_mode: str | None = None,
         panels: Sequence[str] | None = None,
         goal_sampling: str = "episode",
+        autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
+        max_episode_steps: int | None = None,
         **options: Any,
     ) -> None:
+        modes = {mode.value: mode for mode in (AutoresetMode.NEXT_STEP, AutoresetMode.DISABLED)}
+        if autoreset_mode not in (*modes, *modes.values()):
+            raise ConfigError(f"autoreset_mode is {autoreset_mode!r}; it is one of {', '.join(modes)}")
+        self.autoreset_mode = AutoresetMode(autoreset_mode)
+        self.metadata = {**self.metadata, "autoreset_mode": self.autoreset_mode}  # type: ignore[misc]
+        if max_episode_steps is not None:
+            options.setdefault("max_steps", max_episode_steps)
         options = {"goals": goals, "goal_sampling": goal_sampling, **options}
         self._task = GymTask(scenes, num_envs, observation, render_mode, panels, options)
         self._ended = np.zeros(num_envs, dtype=np.bool_)
@@ -185,6 +200,13 @@ class TargetNavVector(VectorEnv[Observation, np.ndarray, np.ndarray]):
     ) -> tuple[Observation, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
         """Move every row by its action (n,), or begin its next episode if it ended with the step before."""
         again = self._ended
+        if again.any():
+            if self.autoreset_mode == AutoresetMode.DISABLED:
+                raise ConfigError(
+                    f"the episode of row {int(again.argmax())} is over; reset it with"
+                    " options={'reset_mask': ...}, or make the environment with autoreset_mode='NextStep'"
+                )
+            actions = np.where(again, 0, actions)
         reward, terminated, truncated = self._task.step(actions)
         if again.any():
             self._task.begin(again, None)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+import reprlib
 from collections.abc import Sequence
 from os import PathLike
 from typing import Any
@@ -9,16 +11,17 @@ from typing import Any
 import numpy as np
 import torch
 from gymnasium import spaces
+from gymnasium.envs.registration import EnvSpec
 from tensordict import TensorDict
 from torch import Tensor
 
 from vusfa.envs.navigation import TargetNavEnv
 from vusfa.envs.observation import observation_table
 from vusfa.envs.starts import DRAW_LIMIT
-from vusfa.errors import ConfigError
+from vusfa.errors import ActionError, ConfigError
 from vusfa.scenes import SceneSet
 
-__all__ = ["GymTask", "Observation", "Scenes"]
+__all__ = ["GymTask", "Observation", "Scenes", "TellsLimit"]
 
 Scenes = SceneSet | str | PathLike[str] | Sequence[str | PathLike[str]]
 Observation = dict[str, Any]
@@ -30,7 +33,7 @@ class _Rows(TargetNavEnv):
     def __init__(self, scenes: Scenes | None, num_rows: int, **options: Any) -> None:
         if not isinstance(scenes, SceneSet):
             scenes = SceneSet.bundled() if scenes is None else SceneSet.open(scenes)
-        super().__init__(scenes, batch_size=[num_rows], **options)
+        super().__init__(scenes, batch_size=[num_rows], shortest_path=True, **options)
         self.rngs: list[Any] = [None] * num_rows
         self.drawing = np.zeros(num_rows, dtype=np.bool_)
 
@@ -39,6 +42,26 @@ class _Rows(TargetNavEnv):
         for row in self.drawing.nonzero()[0]:
             draws[row] = self.rngs[row].integers(DRAW_LIMIT, size=count)
         return torch.from_numpy(np.moveaxis(draws, 0, -1))
+
+
+class TellsLimit:
+    """Base of environments whose Gymnasium ``EnvSpec`` tells the task's limit of actions."""
+
+    _task: GymTask
+    _spec: EnvSpec | None = None
+
+    @property
+    def spec(self) -> EnvSpec | None:
+        """What Gymnasium made it from; ``max_episode_steps`` is the limit in effect."""
+        return self._spec
+
+    @spec.setter
+    def spec(self, spec: EnvSpec | None) -> None:
+        if spec is not None:
+            limits = [self._task.rows.max_steps, spec.max_episode_steps]
+            spec = copy.deepcopy(spec)
+            spec.max_episode_steps = min(limit for limit in limits if limit is not None)
+        self._spec = spec
 
 
 class GymTask:
@@ -86,17 +109,22 @@ class GymTask:
     def begin(self, mask: np.ndarray, options: dict[str, Any] | None) -> None:
         """New episodes in the rows of the mask: at a chosen ``state`` towards a chosen ``goal``, or drawn."""
         self.rows.drawing = mask
-        chosen = {key: value for key, value in (options or {}).items() if key in ("state", "goal")}
-        if len(chosen) == 1:
+        chosen = options or {}
+        if chosen and set(chosen) != {"state", "goal"}:
             raise ConfigError(
-                f"reset options hold only {next(iter(chosen))!r}; give 'state' and 'goal', or neither"
+                f"reset options are {reprlib.repr([*chosen])}; give 'state' and 'goal', or neither"
             )
         fresh = self.rows.set_state(**chosen) if chosen else self.rows.reset()
         self.data = fresh if mask.all() else torch.where(torch.from_numpy(mask), fresh, self.data)
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Move every row; its reward (float64), termination and truncation, (n,) each."""
-        self.data.set("action", torch.from_numpy(np.asarray(action, dtype=np.int64)))
+        if self.data.is_empty():
+            raise ConfigError("step() was called before reset(); call reset() first")
+        action = np.asarray(action)
+        if action.shape != (self.rows.numel(),):
+            raise ActionError(f"actions are of shape {action.shape}; give one each, {(self.rows.numel(),)}")
+        self.data.set("action", torch.from_numpy(action))
         after = self.rows.step(self.data).get("next")
         reward, terminated, truncated = (
             after.get(key)[:, 0].numpy() for key in ("reward", "terminated", "truncated")

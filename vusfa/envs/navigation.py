@@ -8,7 +8,6 @@ integers: 4 of them stand for 4 x 2048 features.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -16,7 +15,7 @@ from torch import Tensor
 
 from vusfa.envs import dynamics
 from vusfa.envs.goals import GoalSpec, resolve_goals
-from vusfa.envs.scene_env import SceneEnv
+from vusfa.envs.scene_env import SceneEnv, usable_device
 from vusfa.envs.starts import DRAW_LIMIT, GoalTable, draw_goals, draw_starts, paths_from
 from vusfa.envs.world import make_world
 from vusfa.errors import ConfigError, GoalError
@@ -31,7 +30,7 @@ class TargetNavEnv(SceneEnv):
 
     Args:
         scenes: the world.
-        goals: which states are goals, see :mod:`vusfa.envs.goals`. Those of several scenes may be mixed.
+        goals: which states are goals, see :mod:`vusfa.envs.goals`.
         batch_size: any shape; ``[]`` is a single agent.
         history: frames that ``state_id`` reaches back, this one included; at reset the first is repeated.
         max_steps: steps after which an episode is truncated.
@@ -39,13 +38,14 @@ class TargetNavEnv(SceneEnv):
             ``(first_goal + i) % G`` and keeps it, as the paper's threads do; "episode" draws one for each
             episode, uniformly over the scenes that have goals and then over the scene's goals.
         first_goal: which goal the first row gets, for workers that share one list of fixed goals.
-        goal_reward: what reaching the goal earns.
-        step_reward: what any other step earns.
-        collision_reward: what a blocked step earns; None for the same as any step. The paper's raw values are
+        goal_reward, step_reward: reward of reaching the goal, and of any other step.
+        collision_reward: reward of a blocked step; None for that of any step. The paper's raw values are
             ``goal_reward=10, step_reward=-0.01, collision_reward=-0.1``.
         seed: where the environment's own random generator begins. None begins somewhere else each time,
             whatever ``torch.manual_seed`` says, so that workers never repeat one another.
         device: where the tables and the data are; the CPU by default.
+        shortest_path: also write the key of that name. It is privileged (no agent could know it), so no
+            policy is given it by default; the trainer's metrics ask for it.
 
     Keys of the data, at the root and under "next" (reward only there):
 
@@ -56,28 +56,36 @@ class TargetNavEnv(SceneEnv):
     state_id       (*B, H)    int64    global ids, oldest first; ``[..., -1]`` is where the agent is
     goal_id        (*B,)      int64    global id; reached when ``state_id[..., -1]`` is it, heading included
     scene_id       (*B,)      int64    index into ``scenes.scenes``
-    collided       (*B, 1)    bool     the last move was blocked; False after a reset
+    elapsed_steps  (*B, 1)    int64    actions since the episode began
     shortest_path  (*B, 1)    int64    actions from the episode's start to its goal, constant in the episode
-    step_count     (*B, 1)    int64    actions since the episode began
+    collided       (*B, 1)    bool     the last move was blocked; False after a reset
     reward         (*B, 1)    float32
     terminated     (*B, 1)    bool     at the goal
     truncated      (*B, 1)    bool     max_steps have passed (also when the last of them reached the goal)
     done           (*B, 1)    bool     either of the two
     =============  =========  =======  =======================================================================
 
+    The environment reads back the action and its state: the keys from state_id to shortest_path. Where a
+    transform drops them (``ExcludeTransform``), the next step is an error; ``SelectTransform`` keeps them.
+
     Episodes begin uniformly over the states that can reach the goal in more than 0 steps. Every draw comes
     from the environment's own generator, whose state :meth:`state_dict` holds: restore it together with the
     tensordict and the run goes on exactly as it would have.
 
+    ``reset`` with a ``_reset`` mask begins new episodes in the rows of the mask, whatever state the
+    tensordict holds. Without one, ``reset(tensordict, set_state=True)`` resumes the episodes that the
+    tensordict describes; rows whose episode is over begin a new one.
+
     Raises:
         GoalError: a goal that does not exist, or that no other state can reach.
-        ConfigError: an argument out of range.
+        ConfigError: an argument out of range; a step without state or action.
+        ActionError: an action that does not exist.
 
     >>> from vusfa.scenes import SceneSet
     >>> env = TargetNavEnv(SceneSet.bundled(["bathroom"]), goals=[73], batch_size=[2], seed=0)
     >>> data = env.set_state(torch.tensor([72, 72]), torch.tensor([73, 73]))
-    >>> data["shortest_path"].tolist(), data["state_id"].tolist()
-    ([[1], [1]], [[72, 72, 72, 72], [72, 72, 72, 72]])
+    >>> data["state_id"].tolist()
+    [[72, 72, 72, 72], [72, 72, 72, 72]]
     >>> after = env.step(data.set("action", torch.tensor([1, 2])))["next"]  # RotateRight, RotateLeft
     >>> after["terminated"].tolist(), after["reward"].tolist()
     ([[True], [False]], [[1.0], [-0.009...]])
@@ -98,6 +106,7 @@ class TargetNavEnv(SceneEnv):
         collision_reward: float | None = None,
         seed: int | None = None,
         device: torch.device | str | None = None,
+        shortest_path: bool = False,
     ) -> None:
         _check_arguments(
             history=history, max_steps=max_steps, goal_sampling=goal_sampling, first_goal=first_goal
@@ -111,9 +120,9 @@ class TargetNavEnv(SceneEnv):
         if goal_sampling == "fixed":
             rows = (torch.arange(self.numel()) + first_goal).reshape(self.batch_size)
         self._world = make_world(self.scenes, self.goals, rewards, rows)
-        self._make_specs()
+        self._make_specs(shortest_path)
         if device is not None:
-            self.to(device)
+            self.to(usable_device(device))
 
     def __repr__(self) -> str:
         options = ("history", "max_steps", "goal_sampling")
@@ -123,50 +132,58 @@ class TargetNavEnv(SceneEnv):
             f" batch_size={list(self.batch_size)}, {values}, device={str(self.device)!r})"
         )
 
-    # -- the two halves of an episode ------------------------------------------------------------------------
-
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         world = self._world
-        goal_id = tensordict.get("goal_id")
+        state, action = (
+            {key: tensordict.get(key, None) for key in keys} for keys in (self._keys, ["action"])
+        )
+        for key, value in {**state, **action}.items():
+            if value is None:
+                raise ConfigError(
+                    f"step() was given no {key!r}; give it the tensordict that reset() or the last step"
+                    f" returned, with all of {', '.join(self._keys)}, and an action in it"
+                )
         after = dynamics.step(
             world.successor,
             world.blocked,
             world.rewards,
             self.max_steps,
-            tensordict.get("state_id"),
-            goal_id,
-            tensordict.get("step_count"),
-            tensordict.get("action"),
+            state["state_id"],
+            state["goal_id"],
+            state["elapsed_steps"],
+            action["action"],
         )
-        entries = after._asdict()
-        for key in ("goal_id", "scene_id", "shortest_path"):
-            entries[key] = tensordict.get(key)
+        entries = {**state, **after._asdict()}
         stepping = tensordict.get("_step", None)
         if stepping is not None:
-            entries = _leave_standing(entries, tensordict, stepping.reshape(self.batch_size))
-        self._show(after.state_id, goal_id)
+            entries = dynamics.stand_still(entries, tensordict, stepping.reshape(self.batch_size))
+        self._show(after.state_id, state["goal_id"])
         return self._wrap(entries)
 
-    def _reset(
-        self, tensordict: TensorDictBase | None = None, set_state: bool = False, **_: Any
-    ) -> TensorDictBase:
-        if set_state and tensordict is not None and "state_id" in tensordict:
+    def _reset(self, tensordict: TensorDictBase | None = None, set_state: bool = False) -> TensorDictBase:
+        mask = None if tensordict is None else tensordict.get("_reset", None)
+        if tensordict is not None and set_state and mask is None and "state_id" in tensordict:
             entries = self._resume(tensordict)
         else:
-            start, goals = self._begin()
-            entries = {
-                "state_id": dynamics.start_history(start, self.history),
-                # copies: nobody may write to the tables through the data
-                "goal_id": goals.goal.clone(),
-                "scene_id": goals.scene.clone(),
-                "shortest_path": paths_from(self._world.distance, goals, start).unsqueeze(-1),
-                "step_count": self._zeros(torch.int64),
-            }
+            entries = self._fresh()
         for key in ("collided", "done", "terminated", "truncated"):
             entries[key] = self._zeros(torch.bool)
-        mask = None if tensordict is None else tensordict.get("_reset", None)
         self._show(entries["state_id"], entries["goal_id"], mask)
         return self._wrap(entries)
+
+    def _fresh(self) -> dict[str, Tensor]:
+        """State of an episode that begins, for every row."""
+        start, goals = self._begin()
+        entries = {
+            "state_id": dynamics.start_history(start, self.history),
+            # copies: nobody may write to the tables through the data
+            "goal_id": goals.goal.clone(),
+            "scene_id": goals.scene.clone(),
+            "elapsed_steps": self._zeros(torch.int64),
+        }
+        if "shortest_path" in self._keys:
+            entries["shortest_path"] = paths_from(self._world.distance, goals, start).unsqueeze(-1)
+        return entries
 
     def _begin(self) -> tuple[Tensor, GoalTable]:
         """Draw an episode for every row: where it starts, and its goal."""
@@ -189,22 +206,21 @@ class TargetNavEnv(SceneEnv):
 
     def _renew(self, following: TensorDictBase, done: Tensor) -> dict[str, Tensor]:
         start, goals = self._begin()
-        path = paths_from(self._world.distance, goals, start)
         mask = done.squeeze(-1)
         entries = {
             "state_id": torch.where(done, start.unsqueeze(-1), following.get("state_id")),
             "goal_id": torch.where(mask, goals.goal, following.get("goal_id")),
             "scene_id": torch.where(mask, goals.scene, following.get("scene_id")),
-            "shortest_path": torch.where(done, path.unsqueeze(-1), following.get("shortest_path")),
-            "step_count": following.get("step_count").masked_fill(done, 0),
+            "elapsed_steps": following.get("elapsed_steps").masked_fill(done, 0),
             "collided": following.get("collided").masked_fill(done, False),
         }
+        if "shortest_path" in self._keys:
+            path = paths_from(self._world.distance, goals, start)
+            entries["shortest_path"] = torch.where(done, path.unsqueeze(-1), following.get("shortest_path"))
         for key in ("done", "terminated", "truncated"):
             entries[key] = torch.zeros_like(done)
         self._show(entries["state_id"], entries["goal_id"])
         return entries
-
-    # -- putting agents where one wants them -----------------------------------------------------------------
 
     def set_state(self, state: Tensor | int, goal: Tensor | int) -> TensorDictBase:
         """Begin an episode in every row at a state of one's choice, towards a goal of one's choice.
@@ -231,8 +247,11 @@ class TargetNavEnv(SceneEnv):
         return self.reset(TensorDict(entries, batch_size=self.batch_size, device=self.device), set_state=True)
 
     def _resume(self, tensordict: TensorDictBase) -> dict[str, Tensor]:
-        """Take up the episodes that a tensordict describes; what it leaves out is that of a fresh episode."""
-        state_id, goal_id = tensordict.get("state_id"), tensordict.get("goal_id")
+        """Take up the episodes that a tensordict describes; what it leaves out is that of a new episode, and
+        rows whose episode is over begin one."""
+        state_id, goal_id = tensordict.get("state_id"), tensordict.get("goal_id", None)
+        if goal_id is None:
+            raise ConfigError("reset() was given a 'state_id' to resume at and no 'goal_id'; give both")
         scenes = self.scenes
         for name, ids in (("state", state_id), ("goal", goal_id)):
             wrong = ids[(ids < 0) | (ids >= scenes.num_states)]
@@ -241,8 +260,11 @@ class TargetNavEnv(SceneEnv):
                     f"{name} {int(wrong[0])} is out of range; the ids are 0..{scenes.num_states - 1}"
                 )
         state = state_id[..., -1]
+        elapsed = tensordict.get("elapsed_steps", self._zeros(torch.int64)).squeeze(-1)
+        over = (elapsed > 0) & ((state == goal_id) | (elapsed >= self.max_steps))
         distance = scenes.distance(state.cpu(), goal_id.cpu())
-        for fault, what in ((distance < 0, "cannot be reached from"), (distance == 0, "is")):
+        for wrong, what in ((distance < 0, "cannot be reached from"), (distance == 0, "is")):
+            fault = wrong & ~over.cpu()
             if fault.any():
                 goal, start = int(goal_id.cpu()[fault][0]), int(state.cpu()[fault][0])
                 raise GoalError(f"goal {goal} {what} state {start}; choose another state or goal")
@@ -250,12 +272,14 @@ class TargetNavEnv(SceneEnv):
             "state_id": state_id.clone(),
             "goal_id": goal_id.clone(),
             "scene_id": scenes.scene_id.to(self.device)[goal_id],
-            "shortest_path": distance.to(self.device).unsqueeze(-1),
-            "step_count": self._zeros(torch.int64),
+            "elapsed_steps": elapsed.unsqueeze(-1).clone(),
         }
-        for key in ("shortest_path", "step_count"):
-            if key in tensordict:
-                entries[key] = tensordict.get(key).clone()
+        if "shortest_path" in self._keys:
+            path = distance.to(self.device).unsqueeze(-1)
+            entries["shortest_path"] = tensordict.get("shortest_path", path).clone()
+        if over.any():
+            fresh = self._fresh()
+            entries = {key: dynamics.rows_where(over, fresh[key], value) for key, value in entries.items()}
         return entries
 
 
@@ -269,15 +293,3 @@ def _check_arguments(*, history: int, max_steps: int, goal_sampling: str, first_
             raise ConfigError(f"{name} is {value}; it must be at least {least}")
     if goal_sampling not in ("fixed", "episode"):
         raise ConfigError(f"goal_sampling is {goal_sampling!r}; it is 'fixed' or 'episode'")
-
-
-def _leave_standing(
-    entries: dict[str, Tensor], before: TensorDictBase, stepping: Tensor
-) -> dict[str, Tensor]:
-    """Undo the step of the rows that are not ``stepping`` (*B,); their reward is 0."""
-    result = {}
-    for key, value in entries.items():
-        old = torch.zeros_like(value) if key == "reward" else before.get(key)
-        mask = stepping.unsqueeze(-1) if value.ndim > stepping.ndim else stepping
-        result[key] = torch.where(mask, value, old)
-    return result

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import reprlib
 from collections.abc import Callable, Sequence
 from typing import Any, ClassVar
 
@@ -17,7 +18,25 @@ from vusfa.errors import ConfigError
 from vusfa.scenes import SceneSet
 from vusfa.torchrl_private import StatelessEnv
 
-__all__ = ["SceneEnv"]
+__all__ = ["SceneEnv", "usable_device"]
+
+
+def usable_device(device: torch.device | str) -> torch.device:
+    """The device of a name.
+
+    Raises:
+        ConfigError: there is no such device, or it cannot be used here.
+
+    >>> usable_device("cpu")
+    device(type='cpu')
+    """
+    try:
+        found = torch.device(device)
+        torch.empty(0, device=found)
+    except (RuntimeError, AssertionError, NotImplementedError) as error:
+        first = str(error).split("\n", 1)[0]
+        raise ConfigError(f"device is {str(device)!r}: {first}; give 'cpu', or one that is there") from error
+    return found
 
 
 class SceneEnv(StatelessEnv):
@@ -45,10 +64,16 @@ class SceneEnv(StatelessEnv):
 
     def __init__(self, scenes: SceneSet, batch_size: Sequence[int], history: int, seed: int | None) -> None:
         if not isinstance(scenes, SceneSet):
-            raise ConfigError(f"scenes is {scenes!r}; give a SceneSet, such as SceneSet.open(['bathroom'])")
+            raise ConfigError(
+                f"scenes is {reprlib.repr(scenes)}; give a SceneSet, such as SceneSet.open(['bathroom'])"
+            )
         if isinstance(batch_size, int):
             raise ConfigError(f"batch_size is {batch_size}; give a list, [{batch_size}]")
-        super().__init__(device=torch.device("cpu"), batch_size=torch.Size(batch_size))
+        try:
+            size = torch.Size(batch_size)
+        except TypeError as error:
+            raise ConfigError(f"batch_size is {reprlib.repr(batch_size)}; give a list, [64]") from error
+        super().__init__(device=torch.device("cpu"), batch_size=size)
         self.scenes = scenes.to("cpu")
         self.history = history
         self._generator = torch.Generator()
@@ -56,8 +81,9 @@ class SceneEnv(StatelessEnv):
         self._set_seed(seed)
         self._shown: tuple[Tensor, Tensor] | None = None
 
-    def _make_specs(self) -> None:
-        specs = env_specs(self.scenes, self.batch_size, self.history)
+    def _make_specs(self, shortest_path: bool) -> None:
+        specs = env_specs(self.scenes, self.batch_size, self.history, shortest_path)
+        self._keys = list(specs.state.keys())
         self.state_spec = specs.state
         self.observation_spec = specs.observation
         self.action_spec = specs.action
@@ -68,11 +94,13 @@ class SceneEnv(StatelessEnv):
 
     def _set_seed(self, seed: int | None) -> None:
         """Start the generator anew; None starts it somewhere else each time."""
-        self._seed = seed
+        if seed is not None and not (isinstance(seed, int | np.integer) and 0 <= seed < 2**63):
+            raise ConfigError(f"seed is {seed!r}; give a whole number of 0 or more, or None")
+        self._seed = None if seed is None else int(seed)
         if seed is None:
             self._generator.seed()
         else:
-            self._generator.manual_seed(seed)
+            self._generator.manual_seed(int(seed))
 
     @property
     def generator(self) -> torch.Generator:

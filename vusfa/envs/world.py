@@ -13,7 +13,10 @@ from vusfa.envs.dynamics import Rewards
 from vusfa.envs.starts import GoalTable, StartTable, start_table
 from vusfa.scenes import SceneSet
 
-__all__ = ["Specs", "World", "env_specs", "make_world", "map_tensors"]
+__all__ = ["STATE", "Observed", "Specs", "World", "env_specs", "make_world", "map_tensors"]
+
+#: Keys that the environment reads back; the last where it was asked for.
+STATE = ("state_id", "goal_id", "scene_id", "elapsed_steps", "shortest_path")
 
 
 class World(NamedTuple):
@@ -86,7 +89,30 @@ class Specs(NamedTuple):
     done: Composite
 
 
-def env_specs(scenes: SceneSet, batch_size: torch.Size, history: int) -> Specs:
+class Observed(Composite):
+    """Observation spec in which the environment's state is always carried on to the next step.
+
+    :class:`torchrl.envs.SelectTransform` keeps the state in the data but takes it out of the observation
+    spec, and ``step_mdp``, which goes by that spec, would then step from the same state for ever.
+
+    >>> spec = Observed(state_id=Unbounded())
+    >>> del spec["state_id"]
+    >>> list(spec.keys()), "state_id" in spec.keys(step_mdp_static_only=True)
+    ([], True)
+    """
+
+    def keys(self, *args: Any, step_mdp_static_only: bool = False, **options: Any) -> Any:
+        """Keys as :class:`Composite` gives them; of those for ``step_mdp`` the state's are never missing."""
+        found = super().keys(*args, step_mdp_static_only=step_mdp_static_only, **options)
+        return [*found, *(key for key in STATE if key not in found)] if step_mdp_static_only else found
+
+    def expand(self, *shape: Any) -> Observed:
+        """As :class:`Composite` expands, to this class."""
+        wide = super().expand(*shape)
+        return Observed(dict(wide.items()), shape=wide.shape, device=wide.device)
+
+
+def env_specs(scenes: SceneSet, batch_size: torch.Size, history: int, shortest_path: bool) -> Specs:
     """Describe the data of a :class:`TargetNavEnv`; its docstring lists the keys.
 
     The state, which the environment needs back at every step because it keeps none, is all that it observes
@@ -104,17 +130,18 @@ def env_specs(scenes: SceneSet, batch_size: torch.Size, history: int) -> Specs:
         return Categorical(2, shape=once, dtype=torch.bool)
 
     def state() -> dict[str, TensorSpec]:
-        return {
+        specs = {
             "state_id": ids(scenes.num_states, history),
             "goal_id": ids(scenes.num_states),
             "scene_id": ids(scenes.num_scenes),
+            "elapsed_steps": count(),
             "shortest_path": count(),
-            "step_count": count(),
         }
+        return {key: specs[key] for key in STATE if shortest_path or key != "shortest_path"}
 
     return Specs(
         state=Composite(state(), shape=batch_size),
-        observation=Composite({**state(), "collided": truth()}, shape=batch_size),
+        observation=Observed({**state(), "collided": truth()}, shape=batch_size),
         action=ids(scenes.num_actions),
         reward=Unbounded(shape=once, dtype=torch.float32),
         done=Composite({key: truth() for key in ("done", "terminated", "truncated")}, shape=batch_size),

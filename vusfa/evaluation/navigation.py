@@ -184,7 +184,7 @@ def walk(
             steps,
             batch.get("action"),
         )
-        frames, steps = end.state_id, end.step_count
+        frames, steps = end.state_id, end.elapsed_steps
         success[row] = end.terminated.squeeze(-1)
         length[row] = steps.squeeze(-1)
         last[row] = frames[:, -1]

@@ -1,11 +1,4 @@
-"""The four models, built from one table of differences.
-
->>> from vusfa.modules import make_agent
->>> from vusfa.scenes import SceneSet
->>> scenes = SceneSet.bundled(["bathroom"])
->>> agent = make_agent(model="vusfa", architecture="controlled", scenes=scenes)
->>> actor, critic = agent.get_policy_operator(), agent.get_value_operator()
-"""
+"""Agents: the layers of one model, and the actor and critic made of them."""
 
 from __future__ import annotations
 
@@ -24,7 +17,8 @@ from tensordict.nn import (
 from tensordict.nn import TensorDictModule as Step
 from torch import nn
 from torch.distributions import Categorical
-from torchrl.envs.transforms import InitTracker, Transform
+from torchrl.data import Unbounded
+from torchrl.envs.transforms import InitTracker, TensorDictPrimer, Transform
 from torchrl.modules import LSTMModule
 
 from vusfa.deprecated import moved_names
@@ -150,6 +144,7 @@ class Agent(nn.Module):
             if config.ideas.bottleneck
             else None,
             normalize=config.normalize_embedding,
+            deduplicate=config.deduplicate,
         )
 
     def make_value(self, config: AgentConfig) -> tuple[nn.Module | None, nn.Module | None, nn.Module]:
@@ -185,11 +180,11 @@ class Agent(nn.Module):
         )
         gaussian = ["state_loc", "state_scale", "state_kl", "goal_loc", "goal_scale", "goal_kl"]
         written = ["state_embedding", "goal_embedding", *(gaussian if self.latent else []), "fused"]
-        steps: dict[str, Step] = {"trunk": Step(SiameseTrunk(self.encoder, self.fusion), read, written)}
+        steps: dict[str, Step] = {"trunk": Observing(SiameseTrunk(self.encoder, self.fusion), read, written)}
         fused = "fused"
         if self.memory is not None:
             fused = "remembered"
-            steps["memory"] = LSTMModule(lstm=self.memory, in_key="fused", out_key=fused)
+            steps["memory"] = Remembering(lstm=self.memory, in_key="fused", out_key=fused)
         steps["scene_layer"] = Step(self.scene_layer, [fused, "scene_id"], ["hidden"])
         if self.successor is not None:
             steps["successor"] = Step(self.successor, ["hidden", "scene_id"], ["successor_features"])
@@ -227,9 +222,8 @@ class Agent(nn.Module):
         """The actor. It computes psi only if its policy head reads it.
 
         Args:
-            out_keys: what it leaves in the tensordict; an LSTM's state is kept besides. Few by default,
-                because everything kept travels through collectors. ``get_dist`` and losses see all of them
-                in any case.
+            out_keys: what it leaves in the tensordict, besides an LSTM's state. Few by default, because all
+                of it travels through collectors; ``get_dist`` and losses see everything in any case.
         """
         sampler = ProbabilisticTensorDictModule(
             in_keys=["logits"],
@@ -253,12 +247,45 @@ class Agent(nn.Module):
         """What an environment must add to its observations: nothing, or an LSTM's start marks and state."""
         if self.memory is None:
             return []
-        return [InitTracker(), self._steps["memory"].make_tensordict_primer()]
+        dtype = next(self.memory.parameters()).dtype
+        shape = (self.memory.num_layers, self.memory.hidden_size)
+        states = {key: Unbounded(shape, dtype=dtype) for key in self._steps["memory"].in_keys[1:3]}
+        return [InitTracker(), TensorDictPrimer(states, expand_specs=True)]
+
+
+class _SaysWhatIsMissing:
+    """A step that names the mend where the tensordict lacks an entry that it reads."""
+
+    mend: str
+
+    def forward(self, *args: Any, **entries: Any) -> Any:
+        """As without it."""
+        try:
+            return super().forward(*args, **entries)  # type: ignore[misc]
+        except KeyError as error:
+            raise ConfigError(f"the agent reads {self.in_keys}; {self.mend} ({error.args[0]})") from error  # type: ignore[attr-defined]
+
+
+class Observing(_SaysWhatIsMissing, Step):
+    """The step that reads observations."""
+
+    mend = (
+        "TargetNavEnv sends ids; for an agent with observation='features' or 'pixels' append the transform"
+        " vusfa.envs.SceneObservation(scenes, kind) to it"
+    )
+
+
+class Remembering(_SaysWhatIsMissing, LSTMModule):
+    """The recurrent step."""
+
+    mend = "give the environment the transforms of agent.make_env_transforms()"
 
 
 def _plain(config: AgentConfig, scenes: Any) -> dict[str, Any]:
     plain = dataclasses.asdict(config)
     plain["picture_size"] = list(config.picture_size)
+    if config.deduplicate:  # a way to compute, not part of what was learned
+        del plain["deduplicate"]
     plain["scenes"] = list(scenes.names)
     plain["fingerprint"] = scenes.fingerprint
     plain["num_actions"] = scenes.num_actions

@@ -12,6 +12,7 @@ from typing import Literal
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
+from torchrl.objectives import add_random_module
 
 from vusfa.errors import ConfigError
 
@@ -124,3 +125,6 @@ class LatentSampler(nn.Module):
         if self.training or self.eval_latent == "sample":
             return loc + scale * self.noise(loc)
         return loc
+
+
+add_random_module(LatentSampler)  # TorchRL's vmap over a critic lets it draw

@@ -123,6 +123,9 @@ class AgentConfig:
         scale: how the bottleneck makes a scale: ``"softplus"`` or ``"raw"``.
         initial_scale: what the scale starts near; ``None``: as the layer is drawn.
         eval_latent: what omega reads in evaluation mode: the ``"mean"`` of z_g or a ``"sample"``.
+        deduplicate: encode each distinct state and goal of a batch once; ``False`` encodes row by row, to the
+            same numbers up to rounding, with shapes that depend on no value. While compiling, exporting and
+            under ``torch.vmap`` that is so in any case.
     """
 
     model: str
@@ -148,6 +151,7 @@ class AgentConfig:
     scale: Literal["softplus", "raw"] = "softplus"
     initial_scale: float | None = None
     eval_latent: Literal["mean", "sample"] = "mean"
+    deduplicate: bool = True
 
     @property
     def ideas(self) -> Model:

@@ -6,6 +6,8 @@ travels to get here), and ``encode(observation)``, the same features for whoever
 
 from __future__ import annotations
 
+import reprlib
+import warnings
 from typing import Any
 
 import torch
@@ -28,7 +30,11 @@ class FeatureFrames(nn.Module):
         features: (S, C, F) float32 of all states, as in ``SceneSet.features``.
         lookup: keep the table; ``False`` for an agent that is handed features.
         normalize: bring every feature to mean 0 and deviation 1 over the S states. The 2 F numbers are
-            part of the ``state_dict``, because the weights behind them mean nothing with others.
+            part of the ``state_dict``, because the weights behind them mean nothing with others. A feature
+            that is the same in all states stays near 0, with a warning that names it.
+
+    Raises:
+        ConfigError: ``normalize``, and no feature changes at all.
 
     >>> frames = FeatureFrames(torch.rand(12, 1, 8), normalize=True)
     >>> frames.lookup(torch.tensor([[3, 5]])).shape, len(frames.state_dict())
@@ -43,15 +49,14 @@ class FeatureFrames(nn.Module):
 
     def __init__(self, features: Tensor, lookup: bool = True, normalize: bool = False) -> None:
         super().__init__()
-        table = features[:, 0].to(torch.float32).contiguous()
+        table = features[:, 0].to(torch.get_default_dtype()).contiguous()
         self.size = table.shape[-1]
         self.normalize = normalize
         self.register_buffer("table", table if lookup else table[:0].clone(), persistent=False)
         self.register_buffer("_converted", None, persistent=False)  # as autocast would
         if normalize:
-            # A feature that never changes would be divided by nothing; it becomes 0 and stays out of the way.
             self.register_buffer("mean", table.mean(0))
-            self.register_buffer("deviation", table.std(0, correction=0).clamp(min=1e-3))
+            self.register_buffer("deviation", _deviation(table))
             # Kept as the encoder wants it, and brought up to date when other numbers are loaded.
             self.table = (self.table - self.mean) / self.deviation
             self._register_load_state_dict_pre_hook(self._renormalize)
@@ -80,6 +85,7 @@ class FeatureFrames(nn.Module):
 
     def encode(self, observation: Tensor) -> Tensor:
         """Features (\\*B, F) as the encoder wants them, of features (\\*B, F) as the scene has them."""
+        observation = observation.to(self.table.dtype)
         return (observation - self.mean) / self.deviation if self.normalize else observation
 
     @torch.no_grad()
@@ -153,7 +159,29 @@ class PictureFrames(nn.Module):
         batch = observation.shape[:-3]
         small = shrink_pictures(observation.reshape(-1, *observation.shape[-3:]), self.picture_size)
         # Centred, so that a dark picture and a light one start equally far from nothing.
-        return self.convolutions(small.to(torch.float32) / 127.5 - 1).view(*batch, self.size)
+        pixels = small.to(next(self.convolutions.parameters()).dtype)
+        return self.convolutions(pixels / 127.5 - 1).view(*batch, self.size)
+
+
+def _deviation(table: Tensor) -> Tensor:
+    """What each feature (F,) of a table (S, F) is divided by: its deviation over the states, and no less than
+    1e-3 or, of features of small scale, a hundredth of the usual deviation."""
+    deviation = table.std(0, correction=0)
+    constant = deviation <= 1e-6 * table.abs().amax(0)  # but for rounding
+    if constant.all():
+        raise ConfigError(
+            f"none of the {len(constant)} features changes over {len(table)} states; encode the scenes again"
+        )
+    floor = deviation[~constant].median().mul(0.01).clamp(max=1e-3)
+    if constant.any():
+        columns = reprlib.repr(constant.nonzero()[:, 0].tolist())
+        warnings.warn(
+            f"{int(constant.sum())} of {len(constant)} features are the same in all states and say nothing:"
+            f" columns {columns}",
+            stacklevel=2,
+        )
+    # a constant one is divided by the largest, to stay small in other scenes, too
+    return deviation.clamp(min=floor).where(~constant, deviation.max())
 
 
 def shrink_pictures(pictures: Tensor, size: tuple[int, int]) -> Tensor:

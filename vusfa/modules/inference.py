@@ -21,10 +21,12 @@ from tensordict.nn.probabilistic import InteractionType, interaction_type
 from torch import Tensor, nn
 
 from vusfa.deprecated import moved_names
+from vusfa.errors import ConfigError
 from vusfa.modules.draws import action_probs, draw, draw_actions
 from vusfa.modules.precision import autocast_copy
 from vusfa.modules.rows import RowScenes, SceneBlocks, SortedByScene
 from vusfa.modules.trunk import CachedTrunk, SiameseTrunk
+from vusfa.modules.unique import shapes_may_vary
 from vusfa.scenes import SceneSet
 
 if TYPE_CHECKING:
@@ -148,7 +150,12 @@ class InferencePolicy(TensorDictModuleBase):
         """Adds ``action``, (\\*B,) int64."""
         if self._table:
             return self._table[0](tensordict)
-        state, goal, scene = (tensordict.get(key) for key in self.in_keys)
+        state, goal, scene = (tensordict.get(key, None) for key in self.in_keys)
+        if state is None or goal is None or scene is None:
+            raise ConfigError(
+                f"the policy reads {self.in_keys}, and some of these are missing; TargetNavEnv sends ids, and"
+                " the transform vusfa.envs.SceneObservation adds observations"
+            )
         batch = scene.dim()
         rows = state.reshape(-1, *state.shape[batch:]), goal.reshape(-1, *goal.shape[batch:])
         actions = draw_actions(self._by_scene(*rows, scene.reshape(-1)), interaction_type())
@@ -156,7 +163,8 @@ class InferencePolicy(TensorDictModuleBase):
 
     def _by_scene(self, state: Tensor, goal: Tensor, scene: Tensor) -> Tensor:
         """Logits of rows in any order, computed scene by scene."""
-        if self.agent.num_scenes == 1 or scene.is_cuda:  # there counting means waiting for the device
+        # on an accelerator counting means waiting for it
+        if self.agent.num_scenes == 1 or scene.is_cuda or not shapes_may_vary(scene):
             return self.logits(state, goal, scene)
         rows, order = SortedByScene.sort(scene, self.agent.num_scenes)
         blocks = SceneBlocks.of(rows, order)

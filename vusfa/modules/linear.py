@@ -13,7 +13,8 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from vusfa.modules.precision import for_autocast, padded_linear
-from vusfa.modules.rows import RowScenes, SceneBlocks, SortedByScene
+from vusfa.modules.rows import RowScenes, SceneBlocks, SortedByScene, count_scenes, unknown_scene
+from vusfa.modules.unique import shapes_may_vary
 
 __all__ = ["HistoryLinear", "SceneLinear"]
 
@@ -79,8 +80,10 @@ class SceneLinear(nn.Module):
             parts = self._products(x, scene_id.counts, weight.unbind(0), bias.unbind(0))
             return parts[0] if len(parts) == 1 else torch.cat(parts)
         rows, scene = x.reshape(-1, self.in_features), scene_id.reshape(-1)
-        if self.num_scenes * self.out_features <= _DENSE_OUTPUTS or (
-            rows.is_cuda and self.num_scenes <= _DENSE_SCENES
+        if (
+            self.num_scenes * self.out_features <= _DENSE_OUTPUTS
+            or (rows.is_cuda and self.num_scenes <= _DENSE_SCENES)
+            or not shapes_may_vary(scene)
         ):
             result = self._all_scenes(rows, scene, weight, bias)
         else:
@@ -90,10 +93,15 @@ class SceneLinear(nn.Module):
     def _all_scenes(self, rows: Tensor, scene: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
         every = padded_linear(rows, weight.flatten(0, 1), bias.flatten())
         every = every.view(-1, self.num_scenes, self.out_features)
-        return every.gather(1, scene.view(-1, 1, 1).expand(-1, 1, self.out_features)).squeeze(1)
+        try:
+            return every.gather(1, scene.view(-1, 1, 1).expand(-1, 1, self.out_features)).squeeze(1)
+        except RuntimeError:
+            if shapes_may_vary(scene) and len(scene) and int(scene.max()) >= self.num_scenes:
+                raise unknown_scene(scene, self.num_scenes) from None
+            raise
 
     def _by_scene(self, rows: Tensor, scene: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
-        counts = torch.bincount(scene, minlength=self.num_scenes).tolist()
+        counts = count_scenes(scene, self.num_scenes)
         # Unbound, not indexed: the gradients of the slices are then stacked once, not added up in full size.
         weights, biases = weight.unbind(0), bias.unbind(0)
         if max(counts) == len(rows):

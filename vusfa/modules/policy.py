@@ -15,6 +15,7 @@ from torch.nn import functional
 
 from vusfa.errors import ConfigError
 from vusfa.modules.linear import SceneLinear
+from vusfa.modules.precision import full_precision
 from vusfa.modules.rows import RowScenes
 
 __all__ = ["PolicyHead", "SuccessorPolicyHead"]
@@ -33,7 +34,7 @@ class PolicyHead(nn.Module):
 
     def forward(self, hidden: Tensor, scene_id: RowScenes) -> Tensor:
         """(\\*B, hidden_size) with scene indices (\\*B,) to logits (\\*B, A) float32."""
-        return self.linear(hidden, scene_id).float()
+        return full_precision(self.linear(hidden, scene_id), self.linear.weight)
 
 
 class SuccessorPolicyHead(nn.Module):
@@ -80,5 +81,5 @@ class SuccessorPolicyHead(nn.Module):
         if self.successor_norm == "layer":
             constant = functional.layer_norm(constant, constant.shape[-1:], eps=1e-6)
         code = functional.relu(self.first(torch.cat([hidden, constant.to(hidden.dtype)], -1), scene_id))
-        logits = self.last(code, scene_id).float()
+        logits = full_precision(self.last(code, scene_id), self.last.weight)
         return functional.relu(logits) if self.rectify_logits else logits

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-__all__ = ["autocast_copy", "bucket_size", "for_autocast", "is_bucketed", "padded_linear"]
+__all__ = ["autocast_copy", "bucket_size", "for_autocast", "full_precision", "is_bucketed", "padded_linear"]
 
 
 def for_autocast(tensor: Tensor) -> Tensor:
@@ -27,6 +27,17 @@ def for_autocast(tensor: Tensor) -> Tensor:
     """
     device = tensor.device.type
     return tensor.to(torch.get_autocast_dtype(device)) if torch.is_autocast_enabled(device) else tensor
+
+
+def full_precision(tensor: Tensor, weight: Tensor) -> Tensor:
+    """A layer's output in the weights' own type; under autocast at least float32.
+
+    >>> full_precision(torch.zeros(2), torch.zeros(1, dtype=torch.float64)).dtype
+    torch.float64
+    """
+    if torch.is_autocast_enabled(tensor.device.type):
+        return tensor.to(torch.promote_types(weight.dtype, torch.float32))
+    return tensor.to(weight.dtype)
 
 
 def autocast_copy(modules: Sequence[Any]) -> list[Any]:

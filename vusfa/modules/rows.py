@@ -9,10 +9,32 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-__all__ = ["RowScenes", "SceneBlocks", "SortedByScene"]
+from vusfa.errors import ConfigError
+
+__all__ = ["RowScenes", "SceneBlocks", "SortedByScene", "count_scenes", "unknown_scene"]
 
 #: Rows are laid out in blocks of one size where that makes them at most this many times as many.
 _PADDING = 1.5
+
+
+def count_scenes(scene: Tensor, num_scenes: int) -> list[int]:
+    """Rows of each scene among (R,) scene indices.
+
+    Raises:
+        ConfigError: an index of ``num_scenes`` or more.
+    """
+    counts: list[int] = torch.bincount(scene, minlength=num_scenes).tolist()
+    if len(counts) > num_scenes:
+        raise unknown_scene(scene, num_scenes)
+    return counts
+
+
+def unknown_scene(scene: Tensor, num_scenes: int) -> ConfigError:
+    """The error of a scene that has no weights."""
+    return ConfigError(
+        f"scene_id holds {int(scene.max())}, and the agent has weights for {num_scenes} scenes; make it with"
+        " the environment's scenes, or with shared_heads=True"
+    )
 
 
 class SortedByScene(NamedTuple):
@@ -29,7 +51,7 @@ class SortedByScene(NamedTuple):
     @classmethod
     def of(cls, scene: Tensor, num_scenes: int) -> SortedByScene:
         """Counts rows whose scenes (R,) ascend."""
-        return cls(scene, torch.bincount(scene, minlength=num_scenes).tolist())
+        return cls(scene, count_scenes(scene, num_scenes))
 
     @classmethod
     def sort(cls, scene: Tensor, num_scenes: int) -> tuple[SortedByScene, Tensor]:

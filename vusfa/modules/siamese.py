@@ -21,8 +21,8 @@ from vusfa.errors import ConfigError
 from vusfa.modules.bottleneck import GaussianBottleneck
 from vusfa.modules.frames import FeatureFrames, PictureFrames
 from vusfa.modules.linear import HistoryLinear
-from vusfa.modules.precision import is_bucketed
-from vusfa.modules.unique import Rows, gather, unique_rows
+from vusfa.modules.precision import full_precision, is_bucketed
+from vusfa.modules.unique import Rows, gather, shapes_may_vary, unique_rows
 
 __all__ = ["Branch", "Encoding", "SiameseEncoder"]
 
@@ -94,6 +94,8 @@ class SiameseEncoder(nn.Module):
         state_layer: one more dense layer for the state alone, before the last (the released VUSFA).
         by_id: the module reads ids of states; ``False``: observations.
         bottleneck: makes a Gaussian of each code; phi is its mean.
+        deduplicate: encode each distinct state and goal of a batch of ids once. ``False`` encodes row by row,
+            as is done in any case while compiling, exporting or under ``torch.vmap``.
         normalize: bring phi to mean 0 and deviation 1 over its E dimensions. Without it, phi, psi and V = psi
             . omega can drive each other up without bound; with a bottleneck, pi and psi go on reading
             full-sized means while the KL term presses the means that omega's sample is made of towards 0.
@@ -118,11 +120,13 @@ class SiameseEncoder(nn.Module):
         by_id: bool = True,
         bottleneck: GaussianBottleneck | None = None,
         normalize: bool = False,
+        deduplicate: bool = True,
     ) -> None:
         super().__init__()
         self.history = history
         self.by_id = by_id
         self.normalize = normalize
+        self.deduplicate = deduplicate
         self.frames = frames
         self.bottleneck = bottleneck
         if bottleneck is not None:
@@ -157,28 +161,41 @@ class SiameseEncoder(nn.Module):
         of_goal = self.encode_goal(goals.values).gather(goals.inverse, batch)
         return joined(of_state, of_goal)
 
+    def check_ids(self, state: Tensor, goal: Tensor) -> None:
+        """Raise a ConfigError where ids are none of the world's; for whoever has failed with them."""
+        for name, ids in (("state_id", state), ("goal_id", goal)) if self.by_id else ():
+            wrong = ids[(ids < 0) | (ids >= self.frames.num_states)]
+            if len(wrong):
+                raise ConfigError(
+                    f"{name} holds {int(wrong[0])}, and the agent's scenes have the states"
+                    f" 0..{self.frames.num_states - 1}; make the agent with the environment's scenes, or take"
+                    " it there with vusfa.modules.transplant"
+                )
+
     def batch_shape(self, state: Tensor) -> torch.Size:
         """\\*B of what :meth:`forward` reads as ``state``."""
         return state.shape[:-1] if self.by_id else state.shape[: -1 - self.frames.frame_dims]
 
     def encode_state(self, first: Tensor) -> Encoding:
         """Encodings of states from the first layer's sums (D, hidden_size)."""
-        return self._encoding(self.branch.finish(first, self.state_layer).float())
+        return self._encoding(self._full(self.branch.finish(first, self.state_layer)))
 
     def encode_goal(self, first: Tensor) -> Encoding:
         """Encodings of goals from the first layer's sums (D, hidden_size)."""
-        return self._encoding((self.goal_branch or self.branch).finish(first).float())
+        return self._encoding(self._full((self.goal_branch or self.branch).finish(first)))
 
     def embed_state(self, first: Tensor) -> Tensor:
         """phi (D, E) alone: a Gaussian's scale is not computed."""
-        return self._phi(
-            self.branch.finish(first, self.state_layer, half=self.bottleneck is not None).float()
-        )
+        half = self.bottleneck is not None
+        return self._phi(self._full(self.branch.finish(first, self.state_layer, half=half)))
 
     def embed_goal(self, first: Tensor) -> Tensor:
         """phi (D, E) of goals alone, as :meth:`embed_state`."""
         branch = self.goal_branch or self.branch
-        return self._phi(branch.finish(first, half=self.bottleneck is not None).float())
+        return self._phi(self._full(branch.finish(first, half=self.bottleneck is not None)))
+
+    def _full(self, code: Tensor) -> Tensor:
+        return full_precision(code, self.branch.first.weight)
 
     def _encoding(self, code: Tensor) -> Encoding:
         if self.bottleneck is None:
@@ -198,6 +215,9 @@ class SiameseEncoder(nn.Module):
         if not self.by_id:
             return self._observed(state, goal)
         self._check_history(state.shape[-1], "state_id")
+        if not (self.deduplicate and shapes_may_vary(state)):
+            lookup = self.frames.lookup
+            return self._row_by_row(lookup(state[..., -self.history :]), lookup(goal))
         states, goals = state[..., -self.history :].reshape(-1, self.history), goal.reshape(-1)
         features, states, goals = self._distinct_frames(states, goals)
         unique, first = unique_rows(goals), self.branch.first
@@ -230,14 +250,17 @@ class SiameseEncoder(nn.Module):
         return self.frames.lookup(distinct), index[:number].view_as(states), index[number:]
 
     def _observed(self, state: Tensor, goal: Tensor) -> tuple[Rows, Rows]:
-        """Every frame of every row."""
+        """As :meth:`first_layer`, of observations."""
+        several = goal.dim() == state.dim()
+        goals = self._newest(goal, "goal_observation") if several else self.frames.encode(goal)
+        return self._row_by_row(self._newest(state, "observation"), goals)
+
+    def _row_by_row(self, states: Tensor, goals: Tensor) -> tuple[Rows, Rows]:
+        """Every frame of every row, from features (\\*B, H, F), and (\\*B, F) or (\\*B, H, F)."""
         goal_first = (self.goal_branch or self.branch).first
-        if goal.dim() == state.dim():
-            goals = goal_first(self._newest(goal, "goal_observation"))
-        else:
-            goals = goal_first.repeated(self.frames.encode(goal))
-        states = self.branch.first(self._newest(state, "observation"))
-        return Rows(states.view(-1, states.shape[-1])), Rows(goals.view(-1, goals.shape[-1]))
+        goal_sums = goal_first(goals) if goals.dim() == states.dim() else goal_first.repeated(goals)
+        state_sums = self.branch.first(states)
+        return tuple(Rows(sums.reshape(-1, sums.shape[-1])) for sums in (state_sums, goal_sums))  # type: ignore[return-value]
 
     def _newest(self, frames: Tensor, key: str) -> Tensor:
         """Features (\\*B, H, F) of the last H frames."""

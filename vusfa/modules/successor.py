@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from vusfa.modules.linear import SceneLinear
-from vusfa.modules.precision import padded_linear
+from vusfa.modules.precision import full_precision, padded_linear
 from vusfa.modules.rows import RowScenes
 
 __all__ = ["RewardHead", "SuccessorHead", "SuccessorValue", "ValueHead"]
@@ -38,7 +38,8 @@ class SuccessorHead(nn.Module):
 
     def forward(self, hidden: Tensor, scene_id: RowScenes) -> Tensor:
         """(\\*B, hidden_size) with scene indices (\\*B,) to (\\*B, E) float32."""
-        successor = self.linear(hidden, scene_id).float()  # nobody else's: scaled where it lies
+        # nobody else's: scaled where it lies
+        successor = full_precision(self.linear(hidden, scene_id), self.linear.weight)
         return successor if self.scale == 1.0 else successor.mul_(self.scale)
 
 
@@ -65,7 +66,8 @@ class RewardHead(nn.Module):
     def forward(self, goal: Tensor) -> Tensor:
         """Goal embedding, or a sample of it, (\\*B, E) to (\\*B, E) float32."""
         first = functional.relu(padded_linear(goal, self.first.weight, self.first.bias))
-        return self.scale * padded_linear(first, self.last.weight, self.last.bias).float()
+        weights = padded_linear(first, self.last.weight, self.last.bias)
+        return self.scale * full_precision(weights, self.last.weight)
 
 
 class SuccessorValue(nn.Module):
@@ -95,4 +97,4 @@ class ValueHead(nn.Module):
 
     def forward(self, hidden: Tensor, scene_id: RowScenes) -> Tensor:
         """(\\*B, hidden_size) with scene indices (\\*B,) to (\\*B, 1) float32."""
-        return self.linear(hidden, scene_id).float()
+        return full_precision(self.linear(hidden, scene_id), self.linear.weight)

@@ -70,6 +70,13 @@ class SiameseTrunk(nn.Module):
 
     def forward(self, state: Tensor, goal: Tensor) -> tuple[Tensor, ...]:
         """What :meth:`SiameseEncoder.forward` returns, and last the fused (\\*B, hidden)."""
+        try:
+            return self._written(state, goal)
+        except (IndexError, RuntimeError):
+            self.encoder.check_ids(state, goal)
+            raise
+
+    def _written(self, state: Tensor, goal: Tensor) -> tuple[Tensor, ...]:
         encoder, fusion, batch = self.encoder, self.fusion, self.encoder.batch_shape(state)
         states, goals = encoder.first_layer(state, goal)
         of_state, of_goal = encoder.encode_state(states.values), encoder.encode_goal(goals.values)
@@ -80,6 +87,13 @@ class SiameseTrunk(nn.Module):
 
     def fused(self, state: Tensor, goal: Tensor) -> Tensor:
         """The fused (\\*B, hidden) alone: no scale is computed and no embedding looked up."""
+        try:
+            return self._fused(state, goal)
+        except (IndexError, RuntimeError):
+            self.encoder.check_ids(state, goal)
+            raise
+
+    def _fused(self, state: Tensor, goal: Tensor) -> Tensor:
         states, goals = self.encoder.first_layer(state, goal)
         state_part = gather(self.fusion.state_part(self.encoder.embed_state(states.values)), states.inverse)
         goal_part = gather(self.fusion.goal_part(self.encoder.embed_goal(goals.values)), goals.inverse)

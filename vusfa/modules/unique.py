@@ -23,7 +23,25 @@ from torch.nn import functional
 
 from vusfa.modules.precision import bucket_size
 
-__all__ = ["Rows", "Unique", "gather", "unique_rows"]
+__all__ = ["Rows", "Unique", "gather", "shapes_may_vary", "unique_rows"]
+
+
+def shapes_may_vary(ids: Tensor) -> bool:
+    """Whether the values of ``ids`` may decide how many rows are computed.
+
+    They may not while compiling or exporting, whose graphs know shapes only, nor under :func:`torch.vmap`,
+    where each member of the batch would have a number of its own.
+
+    >>> shapes_may_vary(torch.arange(3)), torch.vmap(lambda x: x + shapes_may_vary(x))(torch.zeros(2))
+    (True, tensor([0., 0.]))
+    """
+    if torch.compiler.is_compiling() or torch.compiler.is_exporting():
+        return False
+    try:
+        ids.data_ptr()  # a tensor inside vmap has no memory of its own
+    except RuntimeError:
+        return False
+    return True
 
 
 class Unique(NamedTuple):

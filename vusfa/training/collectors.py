@@ -61,7 +61,7 @@ def make_env(scenes: SceneSet, transforms: Sequence[Transform] = (), **settings:
     >>> make_env(SceneSet.bundled(["bathroom"]), batch_size=[5], history=1).batch_size
     torch.Size([5])
     """
-    env = TargetNavEnv(scenes, **settings)
+    env = TargetNavEnv(scenes, shortest_path=True, **settings)
     if not transforms:
         return env
     return TransformedEnv(env, Compose(*(transform.clone() for transform in transforms)))

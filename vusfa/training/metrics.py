@@ -61,7 +61,7 @@ class EpisodeMeter:
             return
         column = self._column[after.get("goal_id")[done].cpu()]
         success = after.get("terminated").squeeze(-1)[done].cpu().to(torch.float64)
-        length = after.get("step_count").squeeze(-1)[done].cpu().to(torch.float64)
+        length = after.get("elapsed_steps").squeeze(-1)[done].cpu().to(torch.float64)
         shortest = after.get("shortest_path").squeeze(-1)[done].cpu().to(torch.float64)
         rows = [torch.ones_like(length), success, length, success * length, success * shortest]
         self._sums.index_add_(1, column, torch.stack(rows))
