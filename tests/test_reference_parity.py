@@ -296,7 +296,7 @@ class TestModels:
             entropy_coeff=0.01 * steps,
             critic_coeff=0.25 * steps,
             successor_coeff=successor_coeff,
-            bottleneck_coeff=released.about["beta"],
+            bottleneck_coeff=released.about["beta"] if released.agent.latent is not None else None,
         )
         if released.name != "m1_gvf":
             return [usf]

@@ -19,6 +19,7 @@ from vusfa.algorithms import (
     make_algorithm,
     register_algorithm,
     register_loss_term,
+    threads_per_step,
 )
 from vusfa.cli.launch import compose
 from vusfa.conf import settings
@@ -137,3 +138,19 @@ def test_a_state_of_another_algorithm_is_refused(make_scene: Callable[..., Scene
     hindsight = trainer_of("algorithm=hindsight").algorithm
     with pytest.raises(CheckpointError, match="of a training without hindsight"):
         hindsight.load_state_dict(trainer_of().algorithm.state_dict())
+
+
+@pytest.mark.parametrize(
+    ("number", "message"),
+    [
+        (0, "threads_per_update is 0; give a whole number of 1 or more"),
+        (1.5, "threads_per_update is 1.5; give a whole number of 1 or more"),
+        (True, "threads_per_update is True; give a whole number of 1 or more"),
+        (30, "threads_per_update is 30, which does not divide the 64 threads; give 16 or 32"),
+        (65, "threads_per_update is 65, which does not divide the 64 threads; give 64"),
+    ],
+)
+def test_a_bad_share_of_the_threads_is_refused(number: object, message: str) -> None:
+    optim = {"kind": "a3c_rmsprop", "options": {"threads_per_update": number}}
+    with pytest.raises(ConfigError, match=rf"^optim\.options\.{message}$"):
+        threads_per_step({"optim": optim, "collector": {"kind": "single", "num_envs": 64}})

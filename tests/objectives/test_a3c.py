@@ -14,7 +14,7 @@ import torch
 from torch import Tensor, nn
 
 from vusfa.objectives import TFRMSprop
-from vusfa.objectives.a3c import A3CRMSprop, check_threads
+from vusfa.objectives.a3c import A3CRMSprop
 
 THREADS, STEPS = 20, 5
 
@@ -239,21 +239,6 @@ def test_the_closures_loss_comes_back() -> None:
 def test_a_bad_number_of_threads_is_refused(number: object) -> None:
     with pytest.raises(ValueError, match=r"^A3CRMSprop: threads is .*; give a whole number of 1 or more$"):
         A3CRMSprop([nn.Parameter(torch.ones(1))], threads=number)  # type: ignore[arg-type]
-
-
-@pytest.mark.parametrize(
-    ("number", "message"),
-    [
-        (0, "threads_per_update is 0; give a whole number of 1 or more"),
-        (1.5, "threads_per_update is 1.5; give a whole number of 1 or more"),
-        (True, "threads_per_update is True; give a whole number of 1 or more"),
-        (30, "threads_per_update is 30, which does not divide the 64 threads; give 16 or 32"),
-        (65, "threads_per_update is 65, which does not divide the 64 threads; give 64"),
-    ],
-)
-def test_a_bad_share_of_the_threads_is_refused(number: object, message: str) -> None:
-    with pytest.raises(ValueError, match=f"^{message}$"):
-        check_threads(64, number)  # type: ignore[arg-type]
 
 
 def test_rates_out_of_range_are_refused_as_ever() -> None:

@@ -195,10 +195,21 @@ class TestDualAscent:
         assert twin.bottleneck_coeff.item() == loss.bottleneck_coeff.item() > 0
 
     def test_needs_a_bottleneck(self, usf, plain) -> None:
-        for networks, coefficient in ((usf(), None), (usf(variational=False), 0.0), (plain(), 0.0)):
+        for networks, coefficient in ((usf(), None), (usf(variational=False), 0.0), (plain(), "auto")):
             loss = USFLoss(networks.actor, networks.critic, bottleneck_coeff=coefficient)
             with pytest.raises(ValueError, match="no bottleneck term; give USFLoss a bottleneck_coeff"):
                 DualAscent(loss)
+
+    def test_one_step_of_several_threads_is_that_many_steps(self, usf, rollout) -> None:
+        networks = usf()
+        loss = USFLoss(networks.actor, networks.critic, bottleneck_coeff=0.1, information_target=0.0)
+        loss(rollout(3, 4))
+        for _ in range(3):
+            DualAscent(loss, step_size=0.5).step()
+        after = loss.bottleneck_coeff.item()
+        loss.bottleneck_coeff = 0.1
+        DualAscent(loss, step_size=0.5, threads=3).step()
+        assert loss.bottleneck_coeff.item() == pytest.approx(after) != 0.1
 
     def test_step_size_out_of_range(self, usf) -> None:
         networks = usf()

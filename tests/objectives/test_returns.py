@@ -12,6 +12,8 @@ from tensordict import TensorDict
 from tensordict.nn import TensorDictModule as Mod
 from tensordict.nn import TensorDictSequential as Seq
 from torch import Tensor, nn
+from torchrl.collectors import Collector
+from torchrl.envs import GymEnv
 from torchrl.modules import LSTMModule, set_recurrent_mode
 from torchrl.objectives.value import GAE, TDLambdaEstimator
 
@@ -447,3 +449,44 @@ class TestErrors:
             estimator.set_keys(unknown="x")
         with pytest.raises(KeyError, match="not found in value network"):
             estimator.set_keys(value="x")
+
+    @pytest.mark.parametrize("missing", ["state", "reward", "done"])
+    def test_what_a_collector_left_out(self, missing: str) -> None:
+        """Without next states (compact_obs=True) V of the last state itself would stand for the future."""
+        td = table_rollout(2, 3, seed=0, ends=0.3).exclude(("next", missing))
+        message = "compact_obs=False" if missing == "state" else rf"no \('next', '{missing}'\)"
+        with pytest.raises(KeyError, match=message):
+            USFEstimator(value_network=table_critic())(td)
+        with pytest.raises(KeyError, match=r"no .*'next'"):
+            USFEstimator(value_network=table_critic())(td.exclude("next"))
+
+    def test_a_compact_collector(self) -> None:
+        env = GymEnv("CartPole-v1")
+        critic = Mod(nn.Linear(4, 1), in_keys=["observation"], out_keys=["state_value"])
+        for compact in (False, True):
+            collector = Collector(
+                env,
+                frames_per_batch=8,
+                total_frames=8,
+                compact_obs=compact,
+                auto_register_policy_transforms=False,
+            )
+            (batch,) = list(collector)
+            if compact:
+                with pytest.raises(KeyError, match=r"none of \['observation'\].*compact_obs=False"):
+                    USFEstimator(value_network=critic)(batch)
+            else:
+                assert USFEstimator(value_network=critic)(batch)["advantage"].isfinite().all()
+
+
+def test_gamma_and_lmbda_are_buffers_that_keep_their_precision() -> None:
+    estimator = USFEstimator(value_network=table_critic(), gamma=0.9, lmbda=0.7)
+    state = {name: value.item() for name, value in estimator.state_dict().items()}
+    assert state == {"gamma": 0.9, "lmbda": 0.7}
+    for moved in (estimator.float(), estimator.half(), estimator.to("meta")):
+        assert (moved.gamma.item(), moved.lmbda.item()) == (0.9, 0.7)
+    other = USFEstimator(value_network=table_critic())
+    other.load_state_dict(estimator.state_dict())
+    assert (other.gamma.item(), other.lmbda.item()) == (0.9, 0.7)
+    other.load_state_dict({})  # of version 0.1
+    assert other.gamma.item() == 0.9

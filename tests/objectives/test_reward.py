@@ -72,5 +72,8 @@ def test_weights_learn_the_reward(agent: Agent) -> None:
 
 def test_a_critic_without_reward_weights() -> None:
     rooms = SceneSet.bundled(["bathroom"])
-    with pytest.raises(ValueError, match="writes no 'reward_weights'"):
-        RewardRegressionLoss(make_agent("gvf", scenes=rooms, hidden_size=8).get_value_operator())
+    loss = RewardRegressionLoss(make_agent("gvf", scenes=rooms, hidden_size=8).get_value_operator())
+    for read in (loss.check, lambda: loss.in_keys, lambda: loss(steps())):
+        with pytest.raises(ValueError, match=r"writes no 'reward_weights'.*reward_weights=") as error:
+            read()
+    assert len(str(error.value)) < 400

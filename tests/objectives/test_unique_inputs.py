@@ -76,7 +76,7 @@ def test_the_loss_and_its_gradients_are_the_same(model: str, reduction: str) -> 
         loss = USFLoss(
             agent.get_policy_operator(),
             critic,
-            bottleneck_coeff=0.3,
+            bottleneck_coeff=0.3 if agent.latent is not None else "auto",
             reduction=reduction,  # type: ignore[arg-type]
             distinct=distinct,
         )

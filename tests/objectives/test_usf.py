@@ -173,6 +173,10 @@ class TestNumbers:
         masked, plain = USFLoss(actor, critic)(padded), USFLoss(*self.networks())(self.data)
         for key in TERMS + DIAGNOSTICS:
             torch.testing.assert_close(masked[key], plain[key])
+        total(masked).backward()
+        assert all(
+            p.grad is None or p.grad.isfinite().all() for p in (*actor.parameters(), *critic.parameters())
+        )
 
 
 class TestTerms:

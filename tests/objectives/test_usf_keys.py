@@ -248,11 +248,56 @@ class TestEstimators:
         with pytest.raises(TypeError, match="lambda_"):
             loss.make_value_estimator(ValueEstimators.GAE, lambda_=0.5)
 
-    @pytest.mark.parametrize("value_type", [ValueEstimators.VTrace, ValueEstimators.MAGAE])
-    def test_those_that_are_not_for_successor_features(self, usf, value_type: ValueEstimators) -> None:
+    @pytest.mark.parametrize(
+        ("value_type", "reason"),
+        [
+            (ValueEstimators.VTrace, "VTrace has no targets of successor features"),
+            ("vtrace", "successor_coeff=None leaves their term out"),
+            (ValueEstimators.MAGAE, "MAGAE is for several agents"),
+            ("magae", "MAGAE is for several agents"),
+        ],
+    )
+    def test_those_that_are_not_for_successor_features(self, usf, value_type: object, reason: str) -> None:
         networks = usf()
-        with pytest.raises(NotImplementedError, match=r"TD0.*TD1.*TDLambda.*GAE"):
+        with pytest.raises(NotImplementedError, match=rf"{reason}.*TD0.*TD1.*TDLambda.*GAE"):
             USFLoss(networks.actor, networks.critic).make_value_estimator(value_type)
+
+    @pytest.mark.parametrize("name", ["gae", "GAE", "td0", "TDLambda", "vtrace"])
+    def test_names(self, plain, rollout, name: str) -> None:
+        networks = plain()
+        value_type = {member.name.lower(): member for member in ValueEstimators}[name.lower()]
+        td = rollout(3, 4)
+        td["action_log_prob"] = networks.actor.get_dist(td.clone()).log_prob(td["action"]).detach()
+        losses = []
+        for chosen in (name, value_type):
+            loss = USFLoss(networks.actor, networks.critic)
+            losses.append(loss.make_value_estimator(chosen, gamma=0.9)(td))
+            assert loss.value_type is value_type
+        torch.testing.assert_close(losses[0].to_dict(), losses[1].to_dict())
+        for unknown in ("gea", "td_lambda", ""):
+            with pytest.raises(ValueError, match=f"value_type is '{unknown}'; give one of .*'gae'"):
+                loss.make_value_estimator(unknown)
+
+    @pytest.mark.parametrize("functional", [True, False])
+    def test_vtrace_is_torchrls(self, plain, rollout, functional: bool) -> None:
+        networks, td = plain(), rollout(3, 4)
+        td["action_log_prob"] = networks.actor.get_dist(td.clone()).log_prob(td["action"]).detach() - 0.3
+        loss = USFLoss(networks.actor, networks.critic, functional=functional)
+        result = loss.make_value_estimator("vtrace", gamma=0.9, rho_thresh=0.8)(td)
+        own = VTrace(value_network=networks.critic, actor_network=networks.actor, gamma=0.9, rho_thresh=0.8)
+        torch.testing.assert_close(result["loss_critic"], loss(own(td.clone()))["loss_critic"])
+        total(result).backward()
+        assert all(p.grad is not None for p in networks.actor.parameters())
+
+    def test_average_gae_is_torchrls(self, plain, rollout) -> None:
+        networks = plain()
+        mine = USFLoss(networks.actor, networks.critic).make_value_estimator("gae", average_gae=True)
+        theirs = GAE(value_network=networks.critic, gamma=0.99, lmbda=0.95, average_gae=True)
+        td = rollout(3, 4)
+        result = mine.value_estimator(td.clone())
+        torch.testing.assert_close(result["advantage"], theirs(td.clone())["advantage"])
+        with pytest.raises(ValueError, match="normalize_advantage and average_gae are both set"):
+            mine.make_value_estimator("gae", average_gae=True, normalize_advantage=True)
 
     def test_an_estimator_or_its_class(self, usf, rollout) -> None:
         networks = usf(variational=False)
@@ -302,6 +347,64 @@ class TestEstimators:
     def test_targets_of_another_estimator_lack_the_successors(self, usf, rollout) -> None:
         networks = usf(variational=False)
         loss = USFLoss(networks.actor, networks.critic)
-        td = GAE(value_network=networks.critic, gamma=0.9, lmbda=0.9)(rollout(3, 4))
-        with pytest.raises(KeyError, match=r"no 'successor_target'.*loss\.value_estimator"):
-            loss(td)
+        estimator = GAE(value_network=networks.critic, gamma=0.9, lmbda=0.9)
+        with pytest.raises(KeyError, match=r"no 'successor_target'.*or leave the advantage out"):
+            loss(estimator(rollout(3, 4)))
+        loss.make_value_estimator(estimator)  # its own: an error that does not point back at it
+        with pytest.raises(
+            KeyError, match=r"the loss's estimator, GAE, computes none.*make_value_estimator\("
+        ):
+            loss(rollout(3, 4))
+        assert "loss_successor" not in USFLoss(
+            networks.actor, networks.critic, successor_coeff=None
+        ).make_value_estimator(estimator)(rollout(3, 4))
+
+
+class TestTermsThatWereAskedFor:
+    """A coefficient that is given requires what its term reads; one that is not, does not."""
+
+    @pytest.mark.parametrize(
+        ("key", "options", "message"),
+        [
+            ("successor_features", {"successor_coeff": 1.0}, "successor_coeff=None"),
+            ("state_embedding", {"successor_coeff": 5e-4}, "successor_coeff=None"),
+            ("state_embedding", {}, "successor_coeff=None"),
+            ("goal_loc", {"bottleneck_coeff": 0.1, "bottleneck_on": "goal"}, "bottleneck_coeff=None"),
+            ("state_scale", {"bottleneck_on": "state"}, "bottleneck_coeff=None"),
+            ("state_value", {}, r"set_keys\(value=\.\.\.\)"),
+        ],
+    )
+    def test_misspelt_entries_are_named(self, usf, rollout, key: str, options: dict, message: str) -> None:
+        networks = usf()
+        parts = [
+            Mod(
+                part.module,
+                in_keys=[f"{k}x" if k == key else k for k in part.in_keys],
+                out_keys=[f"{k}x" if k == key else k for k in part.out_keys],
+            )
+            for part in (networks.parts[name] for name in ("encoder", "split", "goal", "goal_split"))
+        ]
+        parts += [
+            Mod(
+                networks.parts[name].module,
+                in_keys=[f"{k}x" if k == key else k for k in networks.parts[name].in_keys],
+                out_keys=[f"{k}x" if k == key else k for k in networks.parts[name].out_keys],
+            )
+            for name in ("psi", "sample", "omega", "value")
+        ]
+        loss = USFLoss(networks.actor, TensorDictSequential(*parts), **options)
+        for use in (loss.check, lambda: loss(rollout(2, 3))):
+            with pytest.raises(ValueError, match=f"the critic writes no '{key}'.*'{key}x'.*{message}"):
+                use()
+        name = "value" if key == "state_value" else key
+        loss.set_keys(**{name: f"{key}x"})
+        assert set(loss(rollout(2, 3)).keys()) == set(loss.out_keys)
+
+    @pytest.mark.parametrize("options", [{"successor_coeff": 1.0}, {"bottleneck_coeff": 0.0}])
+    def test_a_critic_without_them(self, plain, rollout, options: dict) -> None:
+        networks = plain()
+        with pytest.raises(ValueError, match="leave the term out by"):
+            USFLoss(networks.actor, networks.critic, **options)(rollout(2, 3))
+        none = dict.fromkeys(options)
+        USFLoss(networks.actor, networks.critic, **none)(rollout(2, 3))
+        USFLoss(networks.actor, networks.critic)(rollout(2, 3))

@@ -116,18 +116,32 @@ class TestModule:
         loss = USFLoss(networks.actor, networks.critic, functional=functional)
         other = USFLoss(others.actor, others.critic, functional=functional, entropy_coeff=0.5)
         loss.entropy_coeff, loss.bottleneck_coeff = 0.25, 0.75
-        loss(rollout(2, 3))  # the estimator that this makes has no state of its own
+        loss.make_value_estimator(gamma=0.9, lmbda=0.5)
+        loss(rollout(2, 3))
         state = loss.state_dict()
         buffers = {"objective_coeff", "critic_coeff", "successor_coeff", "entropy_coeff", "bottleneck_coeff"}
         assert buffers | {"information_target", "last_kl"} <= set(state)
         other.load_state_dict(state)
         assert (other.entropy_coeff.item(), other.bottleneck_coeff.item()) == (0.25, 0.75)
         assert other.last_kl.item() == loss.last_kl.item() != 0.2
+        assert (other.value_estimator.gamma.item(), other.value_estimator.lmbda.item()) == (0.9, 0.5)
         networks.critic.eval()
         others.critic.eval()
         expected = loss(rollout(2, 3))
         for key, value in other(rollout(2, 3)).items():
             torch.testing.assert_close(value, expected[key])
+
+    def test_a_state_of_version_0_1_has_no_discount(self, usf, rollout) -> None:
+        networks = usf()
+        loss = USFLoss(networks.actor, networks.critic)
+        loss.make_value_estimator(gamma=0.9)
+        state = {key: value for key, value in loss.state_dict().items() if "_value_estimator" not in key}
+        assert len(state) == len(loss.state_dict()) - 2
+        loss.load_state_dict(state)
+        assert loss.value_estimator.gamma.item() == 0.9
+        fresh = USFLoss(networks.actor, networks.critic)
+        fresh.load_state_dict(state)
+        assert fresh.value_estimator.gamma.item() == 0.99
 
     def test_coefficients_are_scheduled_by_assignment(self, usf, rollout) -> None:
         networks = usf()

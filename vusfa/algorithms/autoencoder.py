@@ -1,4 +1,4 @@
-"""The baseline that the paper's text compares with: a pretrained encoder, and regression of the reward."""
+"""The baseline of the paper's text: a pretrained encoder, and regression of the reward."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ __all__ = ["Autoencoder"]
 
 @register_algorithm("autoencoder")
 class Autoencoder(USF):
-    """phi is an autoencoder's, pretrained on all states and then constant, as in Ma et al. 2018
+    """An autoencoder's phi, pretrained on all states and then constant, as in Ma et al. 2018
     (https://arxiv.org/abs/1804.03758).
 
-    ``preset=autoencoder`` has the numbers that go with it: no gradient of the value
-    (``objective.critic_coeff=0``), omega by regression of the reward (``objective.terms.reward=1``).
+    ``preset=autoencoder`` has its numbers: no gradient of the value (``objective.critic_coeff=0``), omega by
+    regression of the reward (``objective.terms.reward=1``).
 
     Attributes:
         explained: share of the features' variance that the reconstruction explains; None before.
@@ -37,6 +37,6 @@ class Autoencoder(USF):
             )
 
     def prepare(self) -> str:
-        """Pretrains the encoder."""
+        """Pretrain the encoder."""
         self.explained = pretrain_autoencoder(self.agent, seed=self.settings["seed"])
         return f"autoencoder: explains {100 * self.explained:.1f} % of the features' variance"

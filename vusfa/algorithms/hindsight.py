@@ -1,4 +1,4 @@
-"""The paper's algorithm, and off-policy learning towards goals named in hindsight."""
+"""The paper's algorithm with off-policy learning towards goals named in hindsight."""
 
 from __future__ import annotations
 
@@ -19,23 +19,23 @@ from vusfa.scenes import SceneSet
 
 __all__ = ["Hindsight"]
 
+# arguments of HindsightReplay and of HindsightLoss among the settings of hindsight
+_OF_REPLAY = ("capacity", "batch_size", "horizon", "own_future")
+_OF_LOSS = ("critic_coeff", "objective_coeff", "expectile", "temperature", "max_weight")
+
 
 @register_algorithm("hindsight")
 class Hindsight(USF):
     """:class:`~vusfa.algorithms.USF`, and :class:`~vusfa.objectives.HindsightLoss` on transitions from
-    :class:`~vusfa.algorithms.HindsightReplay`; numbers are those of ``settings["hindsight"]``.
+    :class:`~vusfa.algorithms.HindsightReplay`, with the numbers of ``settings["hindsight"]``.
 
-    The first of ``hindsight.updates`` steps is the batch's own: its gradient is the sum of both losses'.
-
-    Attributes:
-        replay: transitions and their goals.
-        hindsight_loss: of a sample.
+    The first of ``hindsight.updates`` steps learns from the batch, too: its gradient is that of both losses.
     """
 
     def __init__(self, agent: Agent, scenes: SceneSet, settings: Mapping[str, Any]) -> None:
         super().__init__(agent, scenes, settings)
-        numbers, task, collector = dict(settings["hindsight"]), settings["env"], settings["collector"]
-        updates = numbers.pop("updates")
+        numbers, task, collector = settings["hindsight"], settings["env"], settings["collector"]
+        updates = numbers["updates"]
         if updates < 1:
             raise ConfigError(f"hindsight.updates is {updates}; give 1 or more, or algorithm=usf")
         if agent.config["observation"] != "index" or agent.config["memory"] is not None:
@@ -54,19 +54,21 @@ class Hindsight(USF):
                 " hindsight's replay have none; give optim=adam, or algorithm=usf"
             )
         self.replay_steps = updates - 1
-        sizes = {name: numbers.pop(name) for name in ("capacity", "batch_size", "horizon", "own_future")}
+        sizes = {name: numbers[name] for name in _OF_REPLAY}
         self.replay = HindsightReplay(scenes.num_states, collector["num_envs"], **sizes)
         try:
             self.hindsight_loss = HindsightLoss(
                 agent.get_policy_operator(),
                 agent.get_value_operator(),
+                **{name: numbers[name] for name in _OF_LOSS},
                 gamma=settings["objective"]["gamma"],
                 goal_reward=task["goal_reward"],
                 step_reward=task["step_reward"],
-                **numbers,
+                functional=False,
             )
         except ValueError as error:
             raise ConfigError(f"hindsight: {error}") from error
+        self.hindsight_loss.to(next(agent.parameters()).device)
 
     def losses(self, batch: TensorDictBase) -> dict[str, Tensor]:
         """On-policy terms, and those of a sample that may hold the batch."""
@@ -85,11 +87,7 @@ class Hindsight(USF):
         return {**super().state_dict(), "replay": self.replay.state_dict()}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Continues with the replay buffer.
-
-        Raises:
-            CheckpointError: the state has none.
-        """
+        """Continue with the replay buffer; a ``CheckpointError`` where the state has none."""
         super().load_state_dict(state)
         if not state.get("replay"):
             raise CheckpointError("of a training without hindsight; give algorithm=usf")

@@ -1,6 +1,6 @@
 """Algorithms and additional loss terms by name.
 
-Both tables are filled by importing modules: nothing is imported because a setting or a checkpoint names it.
+Importing modules fills both tables: nothing is imported because a setting or a checkpoint names it.
 """
 
 from __future__ import annotations
@@ -33,11 +33,7 @@ LOSS_TERMS: dict[str, Callable[[Agent, float], LossModule]] = {}
 
 
 def register_algorithm(name: str) -> Callable[[AlgorithmClass], AlgorithmClass]:
-    """Class decorator: ``algorithm=NAME`` trains with the class.
-
-    Args:
-        name: of the algorithm; an algorithm registered earlier under it is replaced.
-    """
+    """Class decorator: ``algorithm=NAME`` trains with the class. A name registered again is replaced."""
 
     def register(algorithm: AlgorithmClass) -> AlgorithmClass:
         ALGORITHMS[name] = algorithm
@@ -48,11 +44,7 @@ def register_algorithm(name: str) -> Callable[[AlgorithmClass], AlgorithmClass]:
 
 
 def make_algorithm(name: str, agent: Agent, scenes: SceneSet, all_settings: Mapping[str, Any]) -> Algorithm:
-    """An algorithm by name.
-
-    Args:
-        name: that it is registered under.
-        agent, scenes, all_settings: of :class:`~vusfa.algorithms.Algorithm`.
+    """An algorithm by name; the other arguments are those of :class:`~vusfa.algorithms.Algorithm`.
 
     Raises:
         ConfigError: an unknown name, or settings that the algorithm does not fit.
@@ -68,23 +60,20 @@ def make_algorithm(name: str, agent: Agent, scenes: SceneSet, all_settings: Mapp
 
 
 def register_loss_term(name: str, make: Callable[[Agent, float], LossModule]) -> None:
-    """Adds a term to those that ``objective.terms`` may give a coefficient.
+    """Add a term to those that ``objective.terms`` may give a coefficient.
 
     Args:
         name: of the term.
-        make: called with the agent and the coefficient; the ``loss_*`` entries that the module returns hold
-            the coefficient. A :class:`~torchrl.objectives.LossModule` with these arguments will do.
+        make: a function of the agent and the coefficient; the ``loss_*`` entries of the module that it
+            returns hold the coefficient. A :class:`~torchrl.objectives.LossModule` class with these arguments
+            will do.
     """
     LOSS_TERMS[name] = make
     settings.LOSS_TERMS[name] = 0.0
 
 
 def make_loss_terms(agent: Agent, coefficients: Mapping[str, float]) -> list[LossModule]:
-    """Registered terms with a coefficient other than 0.
-
-    Args:
-        agent: what learns.
-        coefficients: name of each term, and its coefficient.
+    """Registered terms of an agent, those with a coefficient other than 0.
 
     Raises:
         ConfigError: an unknown name, or an agent that the term does not fit.

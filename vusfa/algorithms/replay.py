@@ -1,9 +1,8 @@
 """Replay buffer with goals named in hindsight.
 
 TorchRL's :class:`~torchrl.data.HERReplayBuffer` keeps one episode after the other and names goals of the same
-episode. Here many environments walk at once and an episode is spread over many batches, half of the goals
-come from anywhere in the scene that the agent has been, and the steps to a goal are wanted, too: so only the
-sampler is ours; storage and buffer are TorchRL's.
+episode. Here an episode is spread over many batches, half of the goals are any states that the agent has seen
+in the scene, and the steps to a goal are recorded, too: the sampler is ours, storage and buffer TorchRL's.
 """
 
 from __future__ import annotations
@@ -22,14 +21,14 @@ __all__ = ["HindsightReplay", "HindsightSampler", "steps_ahead"]
 
 
 def steps_ahead(clock: Tensor, row: Tensor, num_envs: int, horizon: int) -> Tensor:
-    """Number of recorded steps of each row's walk from that row on, itself included.
+    """Number of recorded steps from each row on to the end of its episode, itself included.
 
     Args:
-        clock: (N,) int64, time-major: row i + num_envs is the same environment's next step. The clock goes on
-            by one a step and leaves one number out where an episode ends.
+        clock: (N,) int64, time-major: row i + num_envs is the same environment's next step. The clock counts
+            steps and leaves one number out where an episode ends.
         row: (n,) int64, rows to start from.
         num_envs: environments.
-        horizon: no more than these many.
+        horizon: the largest number returned.
 
     Returns:
         (n,) int64, 1 to ``horizon``.
@@ -45,17 +44,17 @@ def steps_ahead(clock: Tensor, row: Tensor, num_envs: int, horizon: int) -> Tens
 
 
 class HindsightSampler(RandomSampler):
-    """Sampler of transitions, uniform, and of a goal for each: one that the same walk reached a few steps
-    later, or any state of the scene that the agent has seen.
+    """Uniform sampler of transitions, and of a goal for each: a state that the same episode reached later, or
+    any state of the scene that the agent has seen.
 
-    It adds ``goal_id``, int64, and ``steps_to_goal``, int64, 0 for a goal of the second kind. Rows come
-    sorted by scene and state, which is what per-scene layers are fastest with.
+    It adds ``goal_id``, int64, and ``steps_to_goal``, int64, 0 for a goal of the second kind. Rows are sorted
+    by scene and state, with which per-scene layers are fastest.
 
     Args:
         num_envs: environments; the storage is time-major, see :func:`steps_ahead`.
-        num_states: of the world; ids are below it.
+        num_states: of all scenes; ids are below it.
         horizon: the farthest goal of the first kind, in steps.
-        own_future: part of goals of the first kind.
+        own_future: share of goals of the first kind.
 
     >>> sampler = HindsightSampler(num_envs=1, num_states=9)
     >>> sampler.see(torch.tensor([2, 5, 7, 2]), torch.tensor([0, 0, 1, 0]))
@@ -80,7 +79,7 @@ class HindsightSampler(RandomSampler):
         return self.scene_of >= 0
 
     def see(self, state: Tensor, scene: Tensor) -> None:
-        """Add seen states, ids of any shape, of these scenes."""
+        """Record seen states (ids of any shape) of these scenes."""
         self.scene_of = self.scene_of.to(state.device)
         if not self.seen[state].all():
             self.scene_of[state] = scene
@@ -127,14 +126,13 @@ class HindsightReplay:
     """Replay buffer of a collector's batches, read with goals named in hindsight.
 
     Args:
-        num_states: of the world.
-        num_envs: environments whose batches come, always in the same order.
+        num_states, num_envs, horizon, own_future: see :class:`HindsightSampler`; environments keep their
+            order from batch to batch.
         capacity: frames kept; rounded down to whole steps of all environments.
         batch_size: transitions in a sample.
-        horizon, own_future: of :class:`HindsightSampler`.
 
     Raises:
-        ConfigError: numbers that make no sense, or a capacity below one step of all environments.
+        ConfigError: a number out of its range, or a capacity below one step of all environments.
 
     >>> from vusfa.envs import TargetNavEnv
     >>> from vusfa.scenes import SceneSet
@@ -174,11 +172,8 @@ class HindsightReplay:
         return len(self.buffer)
 
     def extend(self, batch: TensorDictBase) -> None:
-        """Add a collector's batch (num_envs, T), the continuation of the last one.
-
-        Raises:
-            ConfigError: a batch of other environments.
-        """
+        """Add a collector's batch (num_envs, T), the continuation of the last one; a ``ConfigError`` where it
+        is of another number of environments."""
         if batch.shape[0] != self.num_envs:
             raise ConfigError(
                 f"hindsight: a batch of {batch.shape[0]} environments where {self.num_envs} were announced;"

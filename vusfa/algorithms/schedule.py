@@ -6,17 +6,15 @@ from collections.abc import Mapping
 from typing import Any
 
 from vusfa.errors import ConfigError
-from vusfa.objectives.a3c import check_threads
 
 __all__ = ["annealed", "threads_per_step"]
 
 
 def annealed(frames: int, start: float, horizon: int | None, end: float = 0.0) -> float:
-    """A learning rate or coefficient: linear in the frames from ``start`` to ``end`` at ``horizon``, then
-    constant.
+    """A rate or coefficient: linear in the frames from ``start`` to ``end`` at ``horizon``, then constant.
 
-    Without a horizon it stays at ``start``. A function of the frames, not of the number of calls: there is
-    nothing to save, and a resumed run cannot miscount.
+    Without a horizon it stays at ``start``. As a function of the frames it needs no state: a resumed run
+    cannot miscount.
 
     >>> annealed(250, start=4.0, horizon=1000), annealed(250, start=4.0, horizon=None)
     (3.0, 4.0)
@@ -27,11 +25,15 @@ def annealed(frames: int, start: float, horizon: int | None, end: float = 0.0) -
 
 
 def threads_per_step(settings: Mapping[str, Any]) -> int | None:
-    """Threads whose updates one optimizer step stands for (:class:`~vusfa.objectives.A3CRMSprop`), one per
-    environment; None for any other optimizer, which makes one update with the batch's mean gradient.
+    """Threads, one per environment, whose updates one optimizer step stands for
+    (:class:`~vusfa.objectives.A3CRMSprop`).
 
     Args:
-        settings: all settings of a training.
+        settings: all settings of a training; ``optim.options.threads_per_update`` is the number, None for all
+            environments of a batch.
+
+    Returns:
+        None for any other optimizer, which makes one update with the batch's mean gradient.
 
     Raises:
         ConfigError: a number that does not divide the batch's environments.
@@ -45,7 +47,17 @@ def threads_per_step(settings: Mapping[str, Any]) -> int | None:
         return None
     collector = settings["collector"]
     workers = collector["num_workers"] if collector["kind"] == "multi_async" else 1
-    try:
-        return check_threads(collector["num_envs"] // workers, optim["options"].get("threads_per_update"))
-    except ValueError as error:
-        raise ConfigError(f"optim.options.{error}") from error
+    threads = collector["num_envs"] // workers
+    given = optim["options"].get("threads_per_update")
+    if given is None:
+        return threads
+    name = f"optim.options.threads_per_update is {given!r}"
+    if not isinstance(given, int) or isinstance(given, bool) or given < 1:
+        raise ConfigError(f"{name}; give a whole number of 1 or more")
+    if threads % given:
+        divisors = [n for n in range(1, threads + 1) if threads % n == 0]
+        near = [max(n for n in divisors if n < given), *(n for n in divisors if n > given)][:2]
+        raise ConfigError(
+            f"{name}, which does not divide the {threads} threads; give {' or '.join(map(str, near))}"
+        )
+    return given

@@ -22,31 +22,39 @@ __all__ = ["USF", "make_usf_loss"]
 
 # arguments of USFEstimator and of DualAscent among the settings of objective; the others are USFLoss's
 _OF_TARGETS = ("gamma", "lmbda", "normalize_advantage", "min_advantage_std", "bootstrap_at_timeout")
-_OF_ASCENT = {"bottleneck_step_size": "step_size"}
+_OF_ASCENT = {"bottleneck_step_size": "step_size", "threads": "threads"}
+# coefficients that the settings have for every model, and what a critic with such a term writes
+_OF_SOME_MODELS = {"successor_coeff": "successor_features", "bottleneck_coeff": "goal_loc"}
 # buffers of the loss that training moves; the others are settings
 _ADAPTED = ("bottleneck_coeff", "last_kl")
 
-register_loss_term(
-    "reward", lambda agent, coefficient: RewardRegressionLoss(agent.get_value_operator(), coefficient)
-)
+
+def _reward_regression(agent: Agent, coefficient: float) -> RewardRegressionLoss:
+    loss = RewardRegressionLoss(agent.get_value_operator(), coefficient, functional=False)
+    loss.check()
+    return loss
+
+
+register_loss_term("reward", _reward_regression)
 
 
 def make_usf_loss(
     actor: ProbabilisticTensorDictSequential, critic: TensorDictModuleBase, **objective: Any
 ) -> tuple[USFLoss, DualAscent | None]:
-    """The loss, with the estimator of its targets, and the multiplier's ascent if there is a bottleneck.
-
-    For a critic that writes a value alone, as GVF's, the loss is that of plain advantage actor-critic.
+    """The loss of one agent's actor and critic with its estimator, and the multiplier's ascent if there is a
+    bottleneck.
 
     Args:
-        actor, critic: of one agent.
-        objective: settings of the group ``objective``, and ``entropy_coeff``.
+        objective: settings of the group ``objective``, ``entropy_coeff``, and ``threads`` of
+            :class:`~vusfa.objectives.DualAscent`.
 
     Raises:
-        ConfigError: settings that make no sense.
+        ConfigError: a setting out of its range.
     """
     ascent = {argument: objective.pop(name) for name, argument in _OF_ASCENT.items() if name in objective}
     targets = {name: objective.pop(name) for name in _OF_TARGETS if name in objective}
+    without = [name for name, key in _OF_SOME_MODELS.items() if key not in critic.out_keys]
+    objective |= dict.fromkeys(without, "auto")
     try:
         loss = USFLoss(actor, critic, distinct=True, **objective)
         loss.make_value_estimator(USFEstimator(value_network=critic, **targets))
@@ -58,13 +66,8 @@ def make_usf_loss(
 @register_algorithm("usf")
 class USF(Algorithm):
     """:class:`~vusfa.objectives.USFLoss`, :class:`~vusfa.objectives.DualAscent` of the bottleneck's
-    multiplier, and the registered terms that ``objective.terms`` gives a coefficient.
-
-    Attributes:
-        loss: the paper's terms.
-        multiplier: ascent of the bottleneck's multiplier, or None.
-        terms: additional loss modules.
-    """
+    multiplier (None without a bottleneck), and the registered terms that ``objective.terms`` gives a
+    coefficient."""
 
     def __init__(self, agent: Agent, scenes: SceneSet, settings: Mapping[str, Any]) -> None:
         super().__init__(agent, scenes, settings)
@@ -74,13 +77,12 @@ class USF(Algorithm):
                 f" give algorithm={agent.config['pretrained']}"
             )
         objective = dict(settings["objective"])
-        if self.threads is not None:  # the multiplier moves with each thread's update
-            objective["bottleneck_step_size"] *= self.threads
         coefficients = objective.pop("terms", {})
         self.loss, self.multiplier = make_usf_loss(
             agent.get_policy_operator(out_keys=["action"]),
             agent.get_value_operator(),
             entropy_coeff=settings["entropy"]["start"],
+            threads=self.threads or 1,
             **objective,
         )
         self.terms = make_loss_terms(agent, coefficients)
@@ -88,7 +90,7 @@ class USF(Algorithm):
             module.to(next(agent.parameters()).device)
 
     def schedule(self, frames: int) -> None:
-        """Anneals the entropy's coefficient."""
+        """Anneal the entropy's coefficient."""
         self.loss.entropy_coeff = annealed(frames, **self.settings["entropy"])
 
     def losses(self, batch: TensorDictBase) -> dict[str, Tensor]:
@@ -112,7 +114,7 @@ class USF(Algorithm):
 
     @torch.no_grad()
     def warm_start(self, state: Mapping[str, Any]) -> None:
-        """Takes the multiplier; coefficients are those of the settings.
+        """Take the multiplier; coefficients are those of the settings.
 
         Raises:
             CheckpointError: the state is of another algorithm.

@@ -1,4 +1,4 @@
-"""Log-probability and entropy of actions, one number a step, whatever the distribution of the actor."""
+"""Log-probability and entropy of actions, one number per step, for any distribution."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ def action_log_prob(
     """Log-probability of the actions that a tensordict holds.
 
     Args:
-        distribution: of the actions, batch shape ``(*batch,)``; components of a composite one are summed.
+        distribution: batch shape ``(*batch,)``; components of a composite one are summed.
         tensordict: ``(*batch,)``, with the actions taken.
-        action_key: where they are; a list of keys for a composite distribution.
+        action_key: of these; a list of keys for a composite distribution.
 
     Returns:
         ``(*batch,)``, in nats.
 
     Raises:
-        RuntimeError: when an action requires grad: the data would be part of a graph.
+        RuntimeError: an action requires grad: the data would be part of a graph.
 
     >>> from tensordict import TensorDict
     >>> coin = torch.distributions.Categorical(probs=torch.tensor([[0.5, 0.5]]))
@@ -47,13 +47,7 @@ def action_log_prob(
 
 
 def action_entropy(distribution: Distribution) -> Tensor:
-    """Entropy of the actions; estimated from one sample where it has no closed form.
-
-    Args:
-        distribution: of the actions, batch shape ``(*batch,)``; components of a composite one are summed.
-
-    Returns:
-        ``(*batch,)``, in nats.
+    """Entropy of the actions, ``(*batch,)``, in nats; estimated from one sample where it has no closed form.
 
     >>> action_entropy(torch.distributions.Categorical(probs=torch.tensor([[0.5, 0.5]])))
     tensor([0.6931])

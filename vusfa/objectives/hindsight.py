@@ -1,28 +1,27 @@
-r"""Learning off-policy from an agent's own walks, towards goals that it names in hindsight.
+r"""Off-policy learning from an agent's own walks, towards goals named in hindsight.
 
-A transition that the agent has made says something about every goal g, not only about the one it walked to:
-whether it arrived at g, and, through V(s', g), how far g still is. What it earned is known without asking the
-environment, because every step costs the same: ``goal_reward`` for the step that arrives, ``step_reward`` for
-any other. So V = psi . omega is learned for all goals that the agent can name (Andrychowicz et al., 2017,
-https://arxiv.org/abs/1707.01495), by an expectile, which leans towards the better of the actions in the data
-(Kostrikov et al., 2021, https://arxiv.org/abs/2110.06169), and the policy imitates the actions that turned
-out well, weighted by their advantage (Peng et al., 2019, https://arxiv.org/abs/1910.00177).
+A transition tells something about every goal g: whether it arrived at g, and, through V(s', g), how far g
+still is. Its reward is known without asking the environment: ``goal_reward`` for the step that arrives,
+``step_reward`` for any other. So V = psi . omega is learned for all goals that the agent can name
+(Andrychowicz et al., 2017, https://arxiv.org/abs/1707.01495), by an expectile, which leans towards the better
+of the actions in the data (Kostrikov et al., 2021, https://arxiv.org/abs/2110.06169), and the policy imitates
+these actions, weighted by their advantage (Peng et al., 2019, https://arxiv.org/abs/1910.00177).
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Literal
 
 import torch
 from tensordict import TensorDict, TensorDictBase
-from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModuleBase
-from tensordict.utils import NestedKey
+from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModuleBase, dispatch
+from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor
-from torchrl.objectives import LossModule
 
+from vusfa.objectives.common import NetworkLoss
 from vusfa.objectives.distribution import action_log_prob
-from vusfa.objectives.networks import run_actor_critic, run_critic, select_inputs
+from vusfa.objectives.networks import entry, run_actor_critic, run_critic, select_inputs
 
 __all__ = ["HindsightKeys", "HindsightLoss", "expectile_loss", "relabelled_target", "walked_return"]
 
@@ -41,7 +40,7 @@ def relabelled_target(
         next_value: V(s', g), any shape.
         arrived: bool, of that shape: s' is g.
         gamma: discount per step.
-        goal_reward, step_reward: what the environment gives.
+        goal_reward, step_reward: of the environment.
 
     >>> relabelled_target(torch.tensor([0.5, 0.5, 3.0]), torch.tensor([False, True, False]), gamma=0.9)
     tensor([0.4400, 1.0000, 0.8900])
@@ -52,7 +51,7 @@ def relabelled_target(
 def walked_return(
     steps: Tensor, gamma: float, goal_reward: float = 1.0, step_reward: float = -0.01
 ) -> Tensor:
-    r"""What the agent's own way to g earned, a lower bound of the best: it took ``steps`` steps.
+    r"""The return of the agent's own way to g, k steps long: a lower bound of the best.
 
     .. math::
         \gamma^{k-1} r_g + r \, \frac{1 - \gamma^{k-1}}{1 - \gamma}
@@ -60,7 +59,7 @@ def walked_return(
     Args:
         steps: k, int64, any shape; 0 where the agent did not go there: minus infinity.
         gamma: discount per step, below 1.
-        goal_reward, step_reward: what the environment gives.
+        goal_reward, step_reward: of the environment.
 
     >>> walked_return(torch.tensor([1, 2, 3, 0]), gamma=0.9)
     tensor([1.0000, 0.8900, 0.7910,   -inf])
@@ -71,10 +70,9 @@ def walked_return(
 
 
 def expectile_loss(value: Tensor, target: Tensor, expectile: float) -> Tensor:
-    r"""Squared error, weighted by ``expectile`` where the value is too low and by one minus it where not.
+    r"""Squared error, with weight ``expectile`` where the value is too low and one minus it elsewhere.
 
-    Twice the usual half, so that an expectile of 0.5 is the square:
-    ``2 |tau - 1[target < V]| (target - V)^2``.
+    ``2 |tau - 1[target < V]| (target - V)^2``: twice the usual half, so that tau = 0.5 is the square.
 
     Args:
         value: V, any shape.
@@ -91,28 +89,24 @@ def expectile_loss(value: Tensor, target: Tensor, expectile: float) -> Tensor:
 
 @dataclass
 class HindsightKeys:
-    """Entries of :class:`HindsightLoss`.
+    """Entries of :class:`HindsightLoss`, beside the inputs of its networks.
 
     Attributes:
-        state: ids of the last frames, ``(*batch, H)``, now and under ``"next"``.
-        goal: the goal's id, ``(*batch,)``.
-        action: what was done.
-        steps_to_goal: steps that the agent's own way from here to the goal took, ``(*batch,)``; 0: it did not
-            go there.
+        state: ids of the last H frames, ``(*batch, H)``, now and under ``"next"``.
+        goal: its id, ``(*batch,)``.
+        action: the action taken, or a list of keys for a composite action.
+        steps_to_goal: length of the agent's own way to the goal, ``(*batch,)``; 0 where there is none.
         value: V, which the critic writes.
-
-    >>> HindsightKeys(value="v").value
-    'v'
     """
 
     state: NestedKey = "state_id"
     goal: NestedKey = "goal_id"
-    action: NestedKey = "action"
+    action: NestedKey | list[NestedKey] = "action"
     steps_to_goal: NestedKey = "steps_to_goal"
     value: NestedKey = "state_value"
 
 
-class HindsightLoss(LossModule):
+class HindsightLoss(NetworkLoss):
     r"""Value and policy for goals named in hindsight, from single transitions of any policy.
 
     .. math::
@@ -121,35 +115,38 @@ class HindsightLoss(LossModule):
         \qquad w = \min\big(e^{(y - V(s, g)) / T}, w_{max}\big)
 
     y is :func:`relabelled_target`, R :func:`walked_return`, L :func:`expectile_loss`; targets and weights are
-    constants. Rows that stand on their goal already count for nothing. Modules that actor and critic both
-    hold run once. There is no importance weight: the expectile and the advantage pick among the data's
-    actions, whoever chose them.
+    constants. Rows whose state is the goal, and rows that a mask hides, count for nothing. Modules that actor
+    and critic both hold run once. There is no importance weight: expectile and advantage pick among the
+    data's actions, whoever chose them.
 
     Args:
         actor_network: the policy, with ``get_dist``.
-        critic_network: writes ``state_value``; of its inputs the state differs in the next step, no other.
-        critic_coeff: c_V.
-        objective_coeff: c_pi.
+        critic_network: writes ``state_value``; of its inputs the state alone differs in the next step.
+        critic_coeff: c_V, a buffer; None leaves the term out.
+        objective_coeff: c_pi, a buffer; None leaves the term out.
         gamma: discount per step, in (0, 1).
-        expectile: tau.
-        temperature: T, in units of value.
-        max_weight: w_max.
-        goal_reward, step_reward: what the environment gives.
+        expectile, temperature, max_weight: tau, T (in units of value) and w_max.
+        goal_reward, step_reward: of the environment.
+        reduction: ``"mean"``, ``"sum"`` or ``"none"`` over rows. The policy's mean is weighted by w, as
+            above; its sum is that of w log pi.
+        functional: whether the loss holds the networks' parameters as tensordicts apart from the modules.
 
-    Returns (of ``forward``): ``loss_hindsight_critic`` and ``loss_hindsight_objective``, each with its
-    coefficient, and for the eye ``hindsight_value`` and ``hindsight_advantage``, means.
+    Returns (of ``forward``): ``loss_hindsight_critic`` and ``loss_hindsight_objective``, and for logging
+    ``hindsight_value`` and ``hindsight_advantage``, means.
+
+    Raises:
+        TypeError: an argument is no actor or critic, such as an agent itself.
+        ValueError: an argument is out of its range; in ``forward``, the critic lacks an entry.
 
     >>> from vusfa.modules import make_agent
     >>> from vusfa.scenes import SceneSet
     >>> scenes = SceneSet.bundled(["bathroom"])
     >>> agent = make_agent("usfa", scenes=scenes, history=1, hidden_size=8, embedding_size=8)
     >>> loss = HindsightLoss(agent.get_policy_operator(), agent.get_value_operator())
-    >>> state = torch.randint(scenes.num_states, (5, 1))
+    >>> state, zeros = torch.arange(5), torch.zeros(5, dtype=torch.int64)
     >>> steps = TensorDict({
-    ...     "state_id": state, "goal_id": torch.randint(scenes.num_states, (5,)),
-    ...     "scene_id": torch.zeros(5, dtype=torch.int64), "action": torch.randint(4, (5,)),
-    ...     "steps_to_goal": torch.zeros(5, dtype=torch.int64),
-    ...     "next": {"state_id": (state + 1) % scenes.num_states},
+    ...     "state_id": state.view(5, 1), "next": {"state_id": state.view(5, 1) + 1},
+    ...     "goal_id": state.flip(0), "scene_id": zeros, "action": zeros, "steps_to_goal": zeros,
     ... }, [5])
     >>> sorted(loss(steps).keys())
     ['hindsight_advantage', 'hindsight_value', 'loss_hindsight_critic', 'loss_hindsight_objective']
@@ -158,92 +155,126 @@ class HindsightLoss(LossModule):
     _AcceptedKeys = HindsightKeys
     default_keys = HindsightKeys
     tensor_keys: HindsightKeys
-    out_keys = (
-        "loss_hindsight_critic",
-        "loss_hindsight_objective",
-        "hindsight_value",
-        "hindsight_advantage",
-    )
+    _schedulable_buffers = frozenset({"critic_coeff", "objective_coeff"})
 
     def __init__(
         self,
         actor_network: ProbabilisticTensorDictSequential,
         critic_network: TensorDictModuleBase,
         *,
-        critic_coeff: float = 100.0,
-        objective_coeff: float = 1.0,
+        critic_coeff: float | None = 100.0,
+        objective_coeff: float | None = 1.0,
         gamma: float = 0.95,
         expectile: float = 0.7,
         temperature: float = 0.02,
         max_weight: float = 10.0,
         goal_reward: float = 1.0,
         step_reward: float = -0.01,
+        reduction: Literal["none", "mean", "sum"] | None = "mean",
+        functional: bool = True,
     ) -> None:
         for name, value in (("gamma", gamma), ("expectile", expectile)):
             if not 0 < value < 1:
                 raise ValueError(f"HindsightLoss: {name} is {value}; give a number between 0 and 1")
         for name, value in (("temperature", temperature), ("max_weight", max_weight)):
-            if value <= 0:
+            if not value > 0:
                 raise ValueError(f"HindsightLoss: {name} is {value}; give a number above 0")
-        super().__init__()
-        self.actor_network, self.critic_network = actor_network, critic_network
-        self.actor_network_params = self.critic_network_params = None
-        self.target_actor_network_params = self.target_critic_network_params = None
-        self.critic_coeff, self.objective_coeff = critic_coeff, objective_coeff
+        super().__init__(
+            {"actor_network": actor_network, "critic_network": critic_network},
+            reduction=reduction,
+            functional=functional,
+        )
+        self.register_coeff_buffer("critic_coeff", critic_coeff, device=self._default_device)
+        self.register_coeff_buffer("objective_coeff", objective_coeff, device=self._default_device)
         self.gamma, self.expectile = gamma, expectile
         self.temperature, self.max_weight = temperature, max_weight
         self.goal_reward, self.step_reward = goal_reward, step_reward
+        self._set_action_keys()
 
-    @property
-    def in_keys(self) -> list[NestedKey]:
-        """Everything that ``forward`` reads."""
+    def check(self) -> None:
+        """Raise where the critic lacks an entry; ``forward`` does so, too."""
+        self._check_written("value")
+        read, state = [unravel_key(key) for key in self.critic_network.in_keys], self.tensor_keys.state
+        if unravel_key(state) not in read:
+            raise ValueError(
+                f"HindsightLoss: the critic does not read {state!r}, but {read}; name the state's ids by"
+                " loss.set_keys(state=...)"
+            )
+
+    def _default_in_keys(self) -> list[NestedKey]:
         keys = self.tensor_keys
-        networks = [*self.actor_network.in_keys, *self.critic_network.in_keys]
-        own = [keys.state, keys.goal, keys.action, keys.steps_to_goal, ("next", keys.state)]
-        return list(dict.fromkeys([*own, *networks]))
+        own = [keys.state, keys.goal, *self._action_keys(), keys.steps_to_goal, ("next", keys.state)]
+        return [*own, *self.actor_network.in_keys, *self.critic_network.in_keys]
 
-    def _forward_value_estimator_keys(self, **_: Any) -> None:
-        """There is no estimator."""
+    def _default_out_keys(self) -> list[NestedKey]:
+        present = {
+            "loss_hindsight_critic": self.critic_coeff is not None,
+            "loss_hindsight_objective": self.objective_coeff is not None,
+        }
+        return [*(key for key in present if present[key]), "hindsight_value", "hindsight_advantage"]
 
+    @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """The terms of the loss.
+        """The terms of the loss, scalars, or ``(*batch,)`` with ``reduction="none"``.
 
         Args:
             tensordict: transitions, any batch shape. Not written.
 
-        Returns:
-            scalars, see the class.
+        Raises:
+            KeyError: an entry is missing.
         """
-        keys = self.tensor_keys
-        actor, critic = self.actor_network, self.critic_network
+        self.check()
+        keys, actor, critic = self.tensor_keys, self.actor_network, self.critic_network
+        for key in self._action_keys():
+            entry(self, tensordict, key)
+        state, goal = entry(self, tensordict, keys.state), entry(self, tensordict, keys.goal)
+        following = entry(self, tensordict, ("next", keys.state), "collect with compact_obs=False")
+        hint = "HindsightReplay.sample() writes it; give 0 where the agent did not go to the goal"
+        steps = entry(self, tensordict, keys.steps_to_goal, hint)
         inputs = select_inputs(tensordict, *actor.in_keys, *critic.in_keys)
-        distribution, written = run_actor_critic(actor, critic, inputs)
-        value = self._value(written)
-        following, goal = tensordict.get(("next", keys.state)), tensordict.get(keys.goal)
+        with self._params_in_place():
+            distribution, written = run_actor_critic(actor, critic, inputs)
+            value = self._value(written)
+            with torch.no_grad():
+                after = tensordict.select(*critic.in_keys).set(keys.state, following)
+                next_value = self._value(run_critic(critic, after))
+        rewards = {"goal_reward": self.goal_reward, "step_reward": self.step_reward}
         with torch.no_grad():
-            after = tensordict.select(*critic.in_keys).set(keys.state, following)
-            next_value = self._value(run_critic(critic, after))
-            rewards = {"goal_reward": self.goal_reward, "step_reward": self.step_reward}
             target = relabelled_target(next_value, following[..., -1] == goal, self.gamma, **rewards)
-            walked = walked_return(tensordict.get(keys.steps_to_goal), self.gamma, **rewards)
-            counts = (tensordict.get(keys.state)[..., -1] != goal).float()
+            walked = walked_return(steps, self.gamma, **rewards)
+            counts = state[..., -1] != goal
+            valid = self._valid(tensordict, counts)
+            counts = counts if valid is None else counts & valid
             advantage = target - value
-            weight = counts * (advantage / self.temperature).exp().clamp(max=self.max_weight)
-        number = counts.sum().clamp(min=1)
-        errors = counts * expectile_loss(value, torch.maximum(target, walked), self.expectile)
-        log_prob = action_log_prob(distribution, tensordict, keys.action)
-        return TensorDict(
-            {
-                "loss_hindsight_critic": self.critic_coeff * errors.sum() / number,
-                "loss_hindsight_objective": -self.objective_coeff
-                * (weight * log_prob).sum()
-                / weight.sum().clamp(min=torch.finfo(weight.dtype).tiny),
-                "hindsight_value": (counts * value.detach()).sum() / number,
-                "hindsight_advantage": (counts * advantage).sum() / number,
-            },
-            batch_size=[],
-        )
+            weight = (advantage / self.temperature).exp().clamp(max=self.max_weight)
+            weight = torch.where(counts, weight, 0.0)
+            counts = counts.to(value.dtype)
+        out = TensorDict({}, batch_size=[])
+        if self.critic_coeff is not None:
+            error = expectile_loss(value, torch.maximum(target, walked), self.expectile)
+            out.set("loss_hindsight_critic", self._weighted(self.critic_coeff, error, counts))
+        if self.objective_coeff is not None:
+            log_prob = action_log_prob(distribution, tensordict, keys.action)
+            out.set("loss_hindsight_objective", self._weighted(self.objective_coeff, -log_prob, weight))
+        out.set("hindsight_value", _mean(1.0, value.detach(), counts))
+        out.set("hindsight_advantage", _mean(1.0, advantage, counts))
+        self._clear_weakrefs(tensordict, out, "actor_network_params", "critic_network_params")
+        return out
 
     def _value(self, written: TensorDictBase) -> Tensor:
-        """V, (*batch,), float32."""
-        return written.get(self.tensor_keys.value).squeeze(-1).float()
+        """V, (*batch,), float32 or more."""
+        value = written.get(self.tensor_keys.value).squeeze(-1)
+        return value.to(torch.promote_types(value.dtype, torch.float32))
+
+    def _weighted(self, coefficient: Tensor, values: Tensor, weight: Tensor) -> Tensor:
+        if self.reduction == "mean":
+            return _mean(coefficient, values, weight)
+        # select, not multiply: what a mask hides may be infinite
+        values = coefficient * (weight * torch.where(weight > 0, values, 0.0))
+        return values if self.reduction == "none" else values.sum()
+
+
+def _mean(coefficient: float | Tensor, values: Tensor, weight: Tensor) -> Tensor:
+    """The weighted mean, times a coefficient; 0 where every weight is 0."""
+    total = (weight * torch.where(weight > 0, values, 0.0)).sum()
+    return coefficient * total / weight.sum().clamp(min=torch.finfo(weight.dtype).tiny)

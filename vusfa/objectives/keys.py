@@ -1,4 +1,4 @@
-"""The tensordict entries that the loss and its estimator read and write, renamed by their ``set_keys``."""
+"""The tensordict entries that USFLoss and its estimator read and write, renamed by their ``set_keys``."""
 
 from __future__ import annotations
 
@@ -15,18 +15,9 @@ __all__ = ["EstimatorKeys", "LossKeys"]
 class EstimatorKeys(ValueEstimatorBase._AcceptedKeys):
     """Entries of :class:`~vusfa.objectives.USFEstimator`.
 
-    Attributes:
-        advantage: where the advantage is written.
-        value_target: where the value's target is written.
-        value: the value, which the critic writes.
-        successor_features: psi, which the critic writes.
-        state_embedding: phi, which the critic writes.
-        successor_target: where psi's target is written.
-        reward: under ``"next"``.
-        done: under ``"next"``.
-        terminated: under ``"next"``.
-        steps_to_next_obs: of TorchRL's estimators; not read by ours.
-        sample_log_prob: of TorchRL's estimators; not read by ours.
+    The critic writes ``value``, ``successor_features`` (psi) and ``state_embedding`` (phi); the estimator
+    writes ``advantage``, ``value_target`` and ``successor_target``; ``reward``, ``done`` and ``terminated``
+    are read under ``"next"``. TorchRL's estimators also read the last two; this one does not.
 
     >>> EstimatorKeys(value="v").value
     'v'
@@ -48,28 +39,17 @@ class EstimatorKeys(ValueEstimatorBase._AcceptedKeys):
 
 @dataclass
 class LossKeys:
-    """Entries of :class:`~vusfa.objectives.USFLoss`; those that its estimator has too are passed on to it.
+    """Entries of :class:`~vusfa.objectives.USFLoss`, which passes on those that its estimator has, too.
 
     Attributes:
-        advantage: the advantage; computed when absent.
-        value_target: the value's target.
-        value: the value, which the critic writes.
-        successor_features: psi, which the critic writes.
-        successor_target: psi's target.
-        state_embedding: phi, which the critic writes.
-        state_loc: mean of the state's latent, which the critic writes.
-        state_scale: its scale.
-        goal_loc: mean of the goal's latent, which the critic writes.
-        goal_scale: its scale.
-        state_kl: divergence of the state's latent from N(0, 1), summed over its features, where the critic
-            writes it; computed from mean and scale where not.
-        goal_kl: that of the goal's latent.
+        advantage, value_target, successor_target: targets; computed where the advantage is absent.
+        value, successor_features, state_embedding: V, psi and phi, which the critic writes.
+        state_loc, state_scale, goal_loc, goal_scale: mean and scale of the latents, which the critic writes.
+        state_kl, goal_kl: divergence of each latent from N(0, 1), summed over its features, where the critic
+            writes it; else computed from mean and scale.
         action: the action taken, or a list of keys for a composite action.
-        reward: under ``"next"``.
-        done: under ``"next"``.
-        terminated: under ``"next"``.
-        sample_log_prob: log-probability of the action when it was taken, for estimators that correct for its
-            age (TorchRL's ``VTrace``).
+        reward, done, terminated: under ``"next"``.
+        sample_log_prob: log-probability of the action when it was taken, which TorchRL's ``VTrace`` reads.
 
     >>> LossKeys(value="v").value
     'v'

@@ -1,12 +1,15 @@
 """Run an actor and a critic on the same rows: modules that both hold run once.
 
-An actor and a critic over one trunk hold the very same module objects. Both are run module by module, and the
-critic takes over what the actor's run of a module wrote, where it would run it *on the very same tensors*.
-Nothing is assumed about names or order: two networks that share nothing simply share nothing.
+An actor and a critic over one trunk hold the very same module objects. Both run module by module, and the
+critic takes over what a module wrote in the actor, where it would run *on the very same tensors*. Nothing is
+assumed about names or order.
 """
 
 from __future__ import annotations
 
+import contextlib
+import reprlib
+from collections.abc import Iterator
 from typing import Any, TypeAlias, cast
 
 from tensordict import TensorDict, TensorDictBase
@@ -24,16 +27,18 @@ from vusfa.modules.unique import gather, unique_rows
 
 __all__ = [
     "ends_in_distribution",
+    "entry",
     "flatten",
     "run_actor_critic",
     "run_critic",
     "select_inputs",
     "unique_inputs",
+    "use_params",
 ]
 
 #: Module and input tensors, by their ids, to these tensors and what the module wrote.
 _Calls: TypeAlias = dict[tuple[int, ...], tuple[list[Any], dict[NestedKey, Any]]]
-#: Distinct rows per row, up to which computing each once is worth the sorting.
+#: Share of distinct rows up to which computing each once is worth the sorting.
 WORTH = 0.75
 
 
@@ -46,24 +51,11 @@ def run_actor_critic(
         actor: has ``get_dist``, as TorchRL's ``ProbabilisticActor`` and every probabilistic sequence.
         critic: a tensordict module.
         inputs: of both, any batch shape; see :func:`select_inputs`. Not written.
-        index: (\\*B,), the row of the inputs that each row of the distribution belongs to, see
-            :func:`unique_inputs`; for actors of which :func:`ends_in_distribution` is true.
+        index: (\\*B,), each row's place among distinct inputs, see :func:`unique_inputs`; for actors of which
+            :func:`ends_in_distribution` is true.
 
     Returns:
-        the distribution, with the inputs' batch shape, or the index's; and the critic's tensordict.
-
-    >>> import torch
-    >>> from torchrl.modules import ProbabilisticActor
-    >>> from tensordict.nn import TensorDictModule as Mod, TensorDictSequential as Seq
-    >>> calls = []
-    >>> trunk = Mod(lambda x: (calls.append(1), 2 * x)[1], in_keys=["x"], out_keys=["logits"])
-    >>> actor = ProbabilisticActor(
-    ...     trunk, in_keys=["logits"], distribution_class=torch.distributions.Categorical
-    ... )
-    >>> value = Mod(lambda x: x.sum(-1, keepdim=True), in_keys=["logits"], out_keys=["state_value"])
-    >>> _, written = run_actor_critic(actor, Seq(trunk, value), TensorDict({"x": torch.ones(5, 3)}, [5]))
-    >>> written["state_value"].shape, len(calls)
-    (torch.Size([5, 1]), 1)
+        the distribution, with the batch shape of the inputs or of the index; and the critic's tensordict.
     """
     actor_steps, critic_steps = _actor_modules(actor), flatten(critic)
     if not actor_steps:
@@ -98,12 +90,7 @@ def _run(modules: list[TensorDictModuleBase], tensordict: TensorDictBase, calls:
 
 
 def run_critic(critic: nn.Module, inputs: TensorDictBase) -> TensorDictBase:
-    """Everything that a critic writes, hidden by it or not.
-
-    Args:
-        critic: a tensordict module.
-        inputs: holds the critic's inputs, any batch shape. Not written.
-    """
+    """Everything that a critic writes, hidden by it or not; the inputs are not written."""
     judged = _select(inputs, critic.in_keys)
     for module in flatten(critic):
         judged = module(judged)
@@ -111,14 +98,9 @@ def run_critic(critic: nn.Module, inputs: TensorDictBase) -> TensorDictBase:
 
 
 def unique_inputs(inputs: TensorDictBase) -> tuple[TensorDictBase, Tensor] | None:
-    """The distinct rows of a tensordict of ids, and the place of each row among them.
+    """The distinct rows (D,) of a tensordict of ids (\\*B,), and an index (\\*B,) into them.
 
-    Args:
-        inputs: of any batch shape.
-
-    Returns:
-        the distinct rows (D,) and an index (\\*B,) into them; None where an entry holds something else than
-        one whole number per row, or more than three quarters of the rows are distinct.
+    None where an entry is not one whole number per row, or more than three quarters of the rows are distinct.
 
     >>> import torch
     >>> ids = {"state": torch.tensor([[4], [7], [4], [4]]), "goal": torch.tensor([1, 1, 1, 0])}
@@ -145,25 +127,51 @@ def unique_inputs(inputs: TensorDictBase) -> tuple[TensorDictBase, Tensor] | Non
 
 
 def select_inputs(tensordict: TensorDictBase, *keys: NestedKey) -> TensorDictBase:
-    """A dense shallow copy with the given entries, those that exist.
+    """A dense shallow copy with those of the given entries that exist.
 
     Lazy stacks make a new tensor at each access; from this copy actor and critic read the same objects.
-
-    >>> import torch
-    >>> x = torch.ones(2)
-    >>> select_inputs(TensorDict({"x": x, "y": x}, [2]), "x", "z")["x"] is x
-    True
     """
     selected = _select(tensordict, keys)
     return selected if isinstance(selected, TensorDict) else selected.contiguous()
 
 
-def flatten(module: nn.Module) -> list[TensorDictModuleBase]:
-    """The modules that a sequence runs, in order, through sequences within it.
+@contextlib.contextmanager
+def use_params(module: nn.Module, params: TensorDictBase) -> Iterator[None]:
+    """Let a module run with other parameters; its own come back however the block ends.
 
-    A sequence that does more than run its modules one after the other (it hides some of their keys, writes to
-    another tensordict, tolerates missing keys, samples in the middle, or has a ``forward`` of its own) is one
-    module.
+    (``with params.to_module(module)`` leaves them in place after an error, and turns a ``KeyboardInterrupt``
+    into a ``RuntimeError``.)
+
+    >>> import torch
+    >>> layer = torch.nn.Linear(1, 1, bias=False)
+    >>> with use_params(layer, TensorDict({"weight": torch.tensor([[3.0]])}, [])):
+    ...     layer(torch.ones(1)).item()
+    3.0
+    """
+    swapped = params.to_module(module, preserve_module_state=False)
+    swapped.__enter__()
+    try:
+        yield
+    finally:
+        swapped.__exit__(None, None, None)
+
+
+def entry(owner: object, tensordict: TensorDictBase, key: NestedKey, hint: str = "") -> Any:
+    """An entry; where it is missing, a ``KeyError`` names the owner's class, the entry, and ``hint``."""
+    value = tensordict.get(key, None)
+    if value is None:
+        names = reprlib.repr(sorted(str(name) for name in tensordict.keys()))
+        raise KeyError(
+            f"{type(owner).__name__}: the input has no {key!r}; it has {names}" + (hint and f"; {hint}")
+        )
+    return value
+
+
+def flatten(module: nn.Module) -> list[TensorDictModuleBase]:
+    """The modules that a sequence runs, in order, those of sequences within it included.
+
+    A sequence that does more than run its modules (it hides some of their keys, writes to another tensordict,
+    tolerates missing keys, samples in the middle, or has a ``forward`` of its own) is one module.
 
     >>> import torch
     >>> from tensordict.nn import TensorDictModule as Mod, TensorDictSequential as Seq

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import contextlib
-from typing import Any
+from collections.abc import Callable
+from typing import Any, Self
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -14,11 +15,10 @@ from torchrl.objectives.value import ValueEstimatorBase
 
 from vusfa.objectives.functional import lambda_return
 from vusfa.objectives.keys import EstimatorKeys
-from vusfa.objectives.rollout_values import evaluate_rollout
+from vusfa.objectives.networks import entry, use_params
+from vusfa.objectives.rollout_values import check_next, evaluate_rollout
 
 __all__ = ["USFEstimator"]
-
-MASK_KEY = ("collector", "mask")
 
 
 class USFEstimator(ValueEstimatorBase):
@@ -35,24 +35,26 @@ class USFEstimator(ValueEstimatorBase):
     successor features this is the lambda return, and the advantage is the generalised advantage estimate
     (Schulman et al., 2015, https://arxiv.org/abs/1506.02438).
 
-    Targets are constants: nothing is differentiated. The input has shape ``(*batch, T)``; time is the
-    dimension named ``"time"``, else the last. The critic must be one that treats the steps of a batch
-    independently, or a recurrent one by TorchRL's convention, which reads ``is_init``.
+    Targets are constants. The input has shape ``(*batch, T)``; time is the dimension named ``"time"``, else
+    the last. The critic must treat the steps of a batch independently, or be recurrent by TorchRL's
+    convention, which reads ``is_init``.
 
     Args:
         value_network: the critic; writes the value and, if it has them, successor features and state
             embedding.
-        gamma: discount per step.
+        gamma: discount per step; a buffer.
         lmbda: weight of the longer return, in [0, 1]; 1 is the n-step return up to the rollout's end, 0 the
-            one-step target.
-        normalize_advantage: shift and scale the advantages of a batch to mean 0 and deviation 1.
+            one-step target; a buffer.
+        normalize_advantage: shift and scale a batch's advantages to mean 0 and deviation 1; the deviation is
+            the population's.
+        average_gae: the same with the sample's deviation, as ``average_gae`` of TorchRL's GAE.
         min_advantage_std: divide by no less than this. While rewards are rare all advantages are small errors
-            of the critic; brought to deviation 1 they would drive the policy somewhere at random.
+            of the critic; brought to deviation 1 they would move the policy at random.
         bootstrap_at_timeout: ``False`` takes a time-out for a terminal, as the paper's released code does.
         device: accepted for TorchRL's sake; the estimator follows its input.
 
     Raises:
-        ValueError: for a hyperparameter out of its range.
+        ValueError: a hyperparameter out of its range.
 
     >>> from tensordict.nn import TensorDictModule
     >>> critic = TensorDictModule(lambda x: x.sum(-1, keepdim=True), in_keys=["x"], out_keys=["state_value"])
@@ -73,6 +75,8 @@ class USFEstimator(ValueEstimatorBase):
 
     _AcceptedKeys = EstimatorKeys
     default_keys = EstimatorKeys
+    gamma: Tensor
+    lmbda: Tensor
 
     def __init__(
         self,
@@ -81,23 +85,36 @@ class USFEstimator(ValueEstimatorBase):
         gamma: float = 0.99,
         lmbda: float = 1.0,
         normalize_advantage: bool = False,
+        average_gae: bool = False,
         min_advantage_std: float = 1e-4,
         bootstrap_at_timeout: bool = True,
         device: torch.device | str | None = None,
     ) -> None:
         super().__init__(value_network=value_network, device=device)
         gamma, lmbda = float(gamma), float(lmbda)
-        if not 0.0 <= gamma <= 1.0:
-            raise ValueError(f"USFEstimator: gamma is {gamma}; give a number in [0, 1]")
-        if not 0.0 <= lmbda <= 1.0:
-            raise ValueError(f"USFEstimator: lmbda is {lmbda}; give a number in [0, 1]")
+        for name, value in (("gamma", gamma), ("lmbda", lmbda)):
+            if not 0.0 <= value <= 1.0:
+                raise ValueError(f"USFEstimator: {name} is {value}; give a number in [0, 1]")
         if not min_advantage_std > 0.0:
             raise ValueError(f"USFEstimator: min_advantage_std is {min_advantage_std}; give a number above 0")
-        self.gamma = gamma
-        self.lmbda = lmbda
+        if normalize_advantage and average_gae:
+            raise ValueError("USFEstimator: normalize_advantage and average_gae are both set; give one")
+        # in double precision, whatever that of the rewards: 0.99 is no float32
+        self.register_buffer("gamma", torch.tensor(gamma, dtype=torch.float64))
+        self.register_buffer("lmbda", torch.tensor(lmbda, dtype=torch.float64))
         self.normalize_advantage = normalize_advantage
+        self.average_gae = average_gae
         self.min_advantage_std = min_advantage_std
         self.bootstrap_at_timeout = bootstrap_at_timeout
+
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
+        """Both buffers are read as Python numbers: they stay in double precision, on the CPU."""
+        return self
+
+    def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any) -> None:
+        for name, buffer in self.named_buffers():
+            state_dict.setdefault(prefix + name, buffer)  # version 0.1 did not save them
+        super()._load_from_state_dict(state_dict, prefix, *args)
 
     @property
     def has_successor(self) -> bool:
@@ -109,8 +126,8 @@ class USFEstimator(ValueEstimatorBase):
     @property
     def out_keys(self) -> list[NestedKey]:
         """The entries written."""
-        keys = [self.tensor_keys.advantage, self.tensor_keys.value_target]
-        return keys + [self.tensor_keys.successor_target] if self.has_successor else keys
+        keys = self.tensor_keys
+        return [keys.advantage, keys.value_target, *([keys.successor_target] if self.has_successor else [])]
 
     @dispatch
     def forward(
@@ -128,47 +145,38 @@ class USFEstimator(ValueEstimatorBase):
         Args:
             tensordict: ``(*batch, T)``, with the critic's inputs at the root and under ``"next"``, and
                 reward, done and terminated under ``"next"``.
-            params: the critic's parameters; its own, when ``None``.
-            target_params: used in the place of ``params`` when given.
+            params: the critic's parameters; its own when ``None``.
+            target_params: used in place of ``params``.
             time_dim: the dimension of time.
-            written: ``(*batch, T)``, what the critic writes at the root states, by whoever has run it there
-                already. Not differentiated. A recurrent critic is run all the same.
-            index: ``(*batch, T)``, for a ``written`` of distinct rows ``(D,)``: which of them each step's is.
+            written: ``(*batch, T)``, the critic's outputs at the root states, where they are known. Not
+                differentiated; a recurrent critic runs all the same.
+            index: ``(*batch, T)``, each step's row of a ``written`` ``(D,)`` that holds distinct rows.
 
         Returns:
             the same tensordict, with ``advantage`` and ``value_target``, ``(*batch, T, 1)``, and
             ``successor_target``, ``(*batch, T, E)``.
 
         Raises:
-            ValueError: when the tensordict has no time dimension.
+            ValueError: the tensordict has no time dimension.
+            KeyError: an entry is missing, such as the next states (``compact_obs=True`` of a collector).
         """
         if tensordict.batch_dims < 1:
-            raise ValueError(
-                "USFEstimator: a rollout has at least the time dimension; got an empty batch size"
-            )
-        time_dim = self._get_time_dim(time_dim, tensordict)
-        last = tensordict.batch_dims - 1
-        data = tensordict if time_dim == last else tensordict.transpose(time_dim, last)
-        if time_dim != last:
-            index = None if index is None else index.transpose(time_dim, last)
-            written = written if written is None or index is not None else written.transpose(time_dim, last)
-        targets = self._targets(data, params if target_params is None else target_params, written, index)
-        if time_dim != last:
-            targets = targets.transpose(time_dim, last)
-        return tensordict.update(targets)
+            raise ValueError("USFEstimator: a rollout has a time dimension, but the batch size is empty")
+        time_dim, last = self._get_time_dim(time_dim, tensordict), tensordict.batch_dims - 1
+        params = params if target_params is None else target_params
+        if time_dim == last:
+            return tensordict.update(self._targets(tensordict, params, written, index))
+        if index is not None:
+            index = index.transpose(time_dim, last)
+        elif written is not None:
+            written = written.transpose(time_dim, last)
+        targets = self._targets(tensordict.transpose(time_dim, last), params, written, index)
+        return tensordict.update(targets.transpose(time_dim, last))
 
     def value_estimate(
         self, tensordict: TensorDictBase, target_params: TensorDictBase | None = None, **_: Any
     ) -> Tensor:
-        """The value targets alone; see :meth:`forward`.
-
-        Args:
-            tensordict: ``(*batch, T)``, not written.
-            target_params: the critic's parameters; its own, when ``None``.
-
-        Returns:
-            ``(*batch, T, 1)``.
-        """
+        """The value targets alone, ``(*batch, T, 1)``; see :meth:`forward`. The input is not written."""
         targets = self(tensordict.copy(), params=target_params)
         return targets.get(self.tensor_keys.value_target)
 
@@ -181,48 +189,34 @@ class USFEstimator(ValueEstimatorBase):
         index: Tensor | None,
     ) -> TensorDict:
         keys = self.tensor_keys
-        reward = data.get(("next", keys.reward))
-        done = data.get(("next", keys.done))
+        reward = entry(self, data, ("next", keys.reward))
+        done = entry(self, data, ("next", keys.done))
         terminated = data.get(("next", keys.terminated), done)
         if not self.bootstrap_at_timeout:
             terminated = done
-        mask = data.get(MASK_KEY, None)
+        mask = data.get(("collector", "mask"), None)
         ended = _cut_at_padding(done, mask)
 
         wanted = [keys.value]
         if self.has_successor:
             wanted += [keys.successor_features, keys.state_embedding]
-        with (
-            contextlib.nullcontext()
-            if params is None
-            else params.to_module(self.value_network, preserve_module_state=False)
-        ):
+        check_next(self, data, self.value_network)
+        with contextlib.nullcontext() if params is None else use_params(self.value_network, params):
             root, following = evaluate_rollout(
                 self.value_network, data, ended.any(-1), wanted, written, index, [keys.value]
             )
-        value, next_value = root[0].to(reward.dtype), following[0].to(reward.dtype)
-        if not self.has_successor:
-            value_target = self._return(reward, next_value, ended, terminated)
-        else:
-            # reward and embedding (of s_{t+1} on: the paper's Eqs. 4 and 13 and its code, not its Eq. 6) are
-            # summed by the same recursion
-            ends = ended.any(-1, keepdim=True), terminated.any(-1, keepdim=True)
-            value_target = self._return(reward, next_value, *ends)
-            successor_target = self._return(
-                following[2].to(reward.dtype), following[1].to(reward.dtype), *ends
-            )
-        advantage = value_target - value
-        if self.normalize_advantage:
-            advantage = _normalize(advantage, mask, self.min_advantage_std)
-        targets = TensorDict({}, data.batch_size)
-        targets.set(keys.advantage, advantage)
-        targets.set(keys.value_target, value_target)
+        value = root[0].to(reward.dtype)
         if self.has_successor:
-            targets.set(keys.successor_target, successor_target)
-        return targets
-
-    def _return(self, cumulant: Tensor, next_value: Tensor, done: Tensor, terminated: Tensor) -> Tensor:
-        return lambda_return(cumulant, next_value, self.gamma, self.lmbda, done, terminated)
+            ended, terminated = ended.any(-1, keepdim=True), terminated.any(-1, keepdim=True)
+        at_next = [x.to(reward.dtype) for x in following]  # V, psi and phi of s_{t+1}
+        rates = float(self.gamma), float(self.lmbda)
+        returns = [lambda_return(reward, at_next[0], *rates, ended, terminated)]
+        if self.has_successor:  # phi from s_{t+1} on: the paper's Eqs. 4 and 13 and its code, not its Eq. 6
+            returns.append(lambda_return(at_next[2], at_next[1], *rates, ended, terminated))
+        advantage = returns[0] - value
+        if self.normalize_advantage or self.average_gae:
+            advantage = _normalize(advantage, mask, self.min_advantage_std, int(self.average_gae))
+        return TensorDict(dict(zip(self.out_keys, [advantage, *returns], strict=True)), data.batch_size)
 
 
 def _cut_at_padding(done: Tensor, mask: Tensor | None) -> Tensor:
@@ -235,9 +229,9 @@ def _cut_at_padding(done: Tensor, mask: Tensor | None) -> Tensor:
     return done | padding_follows
 
 
-def _normalize(advantage: Tensor, mask: Tensor | None, min_std: float) -> Tensor:
+def _normalize(advantage: Tensor, mask: Tensor | None, min_std: float, correction: int) -> Tensor:
     if mask is None:
         valid = advantage
     else:
         valid = advantage[mask.reshape(*mask.shape[: advantage.ndim - 1], -1).any(-1)]
-    return (advantage - valid.mean()) / valid.std(correction=0).clamp_min(min_std)
+    return (advantage - valid.mean()) / valid.std(correction=correction).clamp_min(min_std)

@@ -3,29 +3,36 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Literal
 
+import torch
 from tensordict import TensorDict, TensorDictBase
-from tensordict.nn import TensorDictSequential
-from tensordict.utils import NestedKey
+from tensordict.nn import TensorDictModuleBase, TensorDictSequential, dispatch
+from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor
-from torchrl.objectives import LossModule
+
+from vusfa.objectives.common import NetworkLoss
+from vusfa.objectives.networks import entry
+from vusfa.objectives.rollout_values import check_next
 
 __all__ = ["RewardRegressionLoss", "reward_regression_loss"]
 
 
 def reward_regression_loss(embedding: Tensor, weights: Tensor, reward: Tensor) -> Tensor:
-    r"""Squared error of the reward that embedding and weights predict, (\*B,).
+    r"""Squared error of the reward that embedding and weights predict.
 
     .. math:: (\phi(s') \cdot \omega(g) - r)^2
 
     Equation 3 of Ma et al., Universal Successor Representations for Transfer Reinforcement Learning
-    (https://arxiv.org/abs/1804.03758), with features of the state arrived in.
+    (https://arxiv.org/abs/1804.03758), with the embedding of the next state.
 
     Args:
         embedding: phi(s'), (\*B, E); a constant.
         weights: omega(g), (\*B, E).
         reward: r, (\*B, 1).
+
+    Returns:
+        (\*B,).
 
     >>> import torch
     >>> phi, omega = torch.tensor([[1.0, 2.0]]), torch.tensor([[3.0, -1.0]])
@@ -38,28 +45,31 @@ def reward_regression_loss(embedding: Tensor, weights: Tensor, reward: Tensor) -
 
 @dataclass
 class RewardKeys:
-    """Names of the entries that the loss reads."""
+    """Entries of :class:`RewardRegressionLoss`: ``reward`` under ``"next"``; the others are the critic's."""
 
     reward: NestedKey = "reward"
     state_embedding: NestedKey = "state_embedding"
     reward_weights: NestedKey = "reward_weights"
 
 
-class RewardRegressionLoss(LossModule):
+class RewardRegressionLoss(NetworkLoss):
     """Trains the layers behind a critic's ``reward_weights``, and nothing else, to predict the reward.
 
-    Beside :class:`~vusfa.objectives.USFLoss` with ``critic_coeff=0`` this is how successor features were
-    trained before the value's gradient went through omega; phi is then usually an autoencoder's.
+    For successor features without a gradient of the value: beside :class:`~vusfa.objectives.USFLoss` with
+    ``critic_coeff=0``, and usually an autoencoder's phi.
 
     Args:
         critic_network: writes ``state_embedding`` and ``reward_weights``; only the modules that these need
-            run, on the next step's entries. What a next step does not hold, such as the goal, is this step's.
-        reward_coeff: the term's coefficient.
+            run, on the next step's entries. What ``"next"`` lacks, such as the goal, is this step's.
+        reward_coeff: the term's coefficient; a buffer.
+        reduction: ``"mean"``, ``"sum"`` or ``"none"`` over steps.
+        functional: whether the loss holds the critic's parameters as a tensordict apart from the modules.
 
-    Returns (of ``forward``): ``loss_reward``, with its coefficient, a scalar.
+    Returns (of ``forward``): ``loss_reward``, with its coefficient.
 
     Raises:
-        ValueError: the critic writes no reward weights.
+        TypeError: the argument is no critic.
+        ValueError: in ``forward``, the critic writes no reward weights (renamed by ``set_keys``).
 
     >>> import torch
     >>> from vusfa.modules import make_agent
@@ -77,41 +87,62 @@ class RewardRegressionLoss(LossModule):
     _AcceptedKeys = RewardKeys
     default_keys = RewardKeys
     tensor_keys: RewardKeys
-    out_keys = ("loss_reward",)
+    _schedulable_buffers = frozenset({"reward_coeff"})
 
-    def __init__(self, critic_network: TensorDictSequential, reward_coeff: float = 1.0) -> None:
-        super().__init__()
-        wanted = [self.tensor_keys.state_embedding, self.tensor_keys.reward_weights]
-        missing = [key for key in wanted if key not in critic_network.out_keys]
-        if missing:
-            raise ValueError(
-                f"RewardRegressionLoss: the critic writes no {missing[0]!r}; one with successor features does"
-            )
-        self.critic_network = critic_network.select_subsequence(out_keys=wanted)
-        self.critic_network_params = self.target_critic_network_params = None
-        self.reward_coeff = reward_coeff
+    def __init__(
+        self,
+        critic_network: TensorDictModuleBase,
+        reward_coeff: float = 1.0,
+        *,
+        reduction: Literal["none", "mean", "sum"] | None = "mean",
+        functional: bool = True,
+    ) -> None:
+        super().__init__({"critic_network": critic_network}, reduction=reduction, functional=functional)
+        self.register_coeff_buffer("reward_coeff", reward_coeff, device=self._default_device)
 
-    @property
-    def in_keys(self) -> list[NestedKey]:
-        """Everything that ``forward`` may read."""
-        networks = list(self.critic_network.in_keys)
-        following: list[Any] = [("next", key) for key in (*networks, self.tensor_keys.reward)]
-        return [*networks, *following]
+    def check(self) -> None:
+        """Raise where the critic lacks an entry; ``forward`` does so, too."""
+        self._check_written("state_embedding", "reward_weights")
 
-    def _forward_value_estimator_keys(self, **_: Any) -> None:
-        """There is no estimator."""
+    def _needed(self) -> TensorDictModuleBase:
+        """The modules of the critic that the term needs."""
+        self.check()
+        keys = self.tensor_keys
+        if not isinstance(self.critic_network, TensorDictSequential):
+            return self.critic_network
+        return self.critic_network.select_subsequence(out_keys=[keys.state_embedding, keys.reward_weights])
 
+    def _default_in_keys(self) -> list[NestedKey]:
+        networks = list(self._needed().in_keys)
+        return [*networks, *(("next", key) for key in (*networks, self.tensor_keys.reward))]
+
+    def _default_out_keys(self) -> list[NestedKey]:
+        return ["loss_reward"]
+
+    @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """The term.
+        """The term, a scalar, or ``(*batch,)`` with ``reduction="none"``.
 
         Args:
             tensordict: steps of any batch shape. Not written.
+
+        Raises:
+            KeyError: an entry is missing, such as the next states (``compact_obs=True`` of a collector).
         """
-        keys, following = self.tensor_keys, tensordict.get("next")
-        inputs = tensordict.select(*self.critic_network.in_keys, strict=False)
-        inputs = inputs.update(following.select(*self.critic_network.in_keys, strict=False))
-        written = self.critic_network(inputs)
-        error = reward_regression_loss(
-            written.get(keys.state_embedding), written.get(keys.reward_weights), following.get(keys.reward)
-        )
-        return TensorDict({"loss_reward": self.reward_coeff * error.mean()}, [])
+        keys, critic = self.tensor_keys, self._needed()
+        check_next(self, tensordict, critic)
+        reward = entry(self, tensordict, ("next", keys.reward))
+        valid = self._valid(tensordict, reward)
+        if valid is not None:  # what a mask hides may be infinite
+            reward = torch.where(valid, reward, 0.0)
+        inputs = tensordict.select(*critic.in_keys, strict=False)
+        inputs = inputs.update(tensordict.get("next").select(*critic.in_keys, strict=False))
+        for key in map(unravel_key, critic.in_keys):
+            entry(self, inputs, key)
+        with self._params_in_place():
+            written = critic(inputs)
+        embedding, weights = written.get(keys.state_embedding), written.get(keys.reward_weights)
+        error = reward_regression_loss(embedding, weights, reward)
+        term = self.reward_coeff * self._reduce_loss(error, tensordict)
+        self._clear_weakrefs(tensordict, "critic_network_params")
+        return TensorDict({"loss_reward": term}, [])

@@ -1,10 +1,8 @@
 """A critic's outputs at every state of a rollout, each state evaluated once.
 
-Bootstrapping needs the critic at the states ``s_0 .. s_{T-1}`` that acted *and* at the states that their
-steps led to. In a rollout the latter are, but for a few, the former shifted by one. So the critic is
-evaluated once over a batch of the T root states and, beside them, only those next states that are not the
-next root: the last of each row, and those of steps that ended an episode in mid-rollout (whose next root
-already belongs to the next episode).
+Bootstrapping needs the critic at the states ``s_0 .. s_{T-1}`` and at the next states, which in a rollout are
+the former shifted by one. So the critic runs once, on the T root states and on those next states that are not
+the next root: the last of each row, and those of steps that ended an episode.
 """
 
 from __future__ import annotations
@@ -14,12 +12,34 @@ from collections.abc import Callable
 import torch
 from tensordict import TensorDictBase
 from tensordict.utils import NestedKey, unravel_key
-from torch import Tensor
+from torch import Tensor, nn
 from torchrl.modules import set_recurrent_mode
 
 from vusfa.modules.unique import gather
+from vusfa.objectives.networks import entry
 
-__all__ = ["evaluate_rollout"]
+__all__ = ["check_next", "evaluate_rollout"]
+
+
+def check_next(owner: object, data: TensorDictBase, critic: nn.Module) -> None:
+    """Raise a ``KeyError``, in the owner's name, where ``"next"`` has no input of the critic, as from a
+    collector with ``compact_obs=True``: its next values would be those of the root."""
+    following = entry(owner, data, "next")
+    carried = {unravel_key(key) for key in critic.out_keys}  # type: ignore[union-attr]
+    inputs = [
+        key
+        for key in map(unravel_key, critic.in_keys)  # type: ignore[arg-type]
+        if not _is_start_mark(key) and unravel_key(("next", key)) not in carried
+    ]
+    if inputs and all(following.get(key, None) is None for key in inputs):
+        raise KeyError(
+            f"{type(owner).__name__}: 'next' has none of {inputs}, which the critic reads; collect with"
+            " compact_obs=False"
+        )
+
+
+def _is_start_mark(key: NestedKey) -> bool:
+    return (key if isinstance(key, str) else key[-1]) == "is_init"
 
 
 def evaluate_rollout(
@@ -31,21 +51,19 @@ def evaluate_rollout(
     index: Tensor | None = None,
     at_root: list[NestedKey] | None = None,
 ) -> tuple[list[Tensor], list[Tensor]]:
-    """A critic's outputs at the states of a rollout and at those that its steps lead to.
+    """A critic's outputs at the root states of a rollout and at its next states.
 
     Args:
         critic: a tensordict module with ``in_keys``.
-        data: ``(*batch, T)``, the critic's inputs at the root and under ``"next"``; what ``"next"`` lacks (a
-            goal that stays) is taken from the root.
+        data: ``(*batch, T)``, the critic's inputs at the root and under ``"next"``; what ``"next"`` lacks,
+            such as the goal, is the root's.
         ended: ``(*batch, T)``, bool: the next root does not follow from this step.
-        out_keys: the outputs wanted.
-        written: ``(*batch, T)``, the outputs at the root states, where they are known; not for recurrent
-            critics.
-        index: ``(*batch, T)``, for a ``written`` of distinct rows ``(D,)``: which of them each step's is.
-        at_root: the outputs wanted at the root states; all of ``out_keys`` when not given.
+        out_keys: of the outputs.
+        written, index: see :meth:`vusfa.objectives.USFEstimator.forward`.
+        at_root: of the outputs at the root states; ``out_keys`` when ``None``.
 
     Returns:
-        two lists, of ``(*batch, T, ...)``: at the root states, in the order of ``at_root``, and at the next
+        two lists of ``(*batch, T, ...)``: at the root states, in the order of ``at_root``, and at the next
         states, in that of ``out_keys``.
     """
     in_keys = [unravel_key(key) for key in critic.in_keys]  # type: ignore[attr-defined]
@@ -53,12 +71,11 @@ def evaluate_rollout(
     following = data.get("next").select(*in_keys, strict=False)
     outside = ended.clone()
     outside[..., -1] = True
-    if any((key if isinstance(key, str) else key[-1]) == "is_init" for key in in_keys):
+    if any(map(_is_start_mark, in_keys)):
         first, second = _evaluate_sequences(critic, root, following, outside, in_keys, out_keys)
         return first if at_root is None else [first[out_keys.index(key)] for key in at_root], second
 
-    # states are independent of each other: one flat batch of the roots, unless they are known, and of next
-    # states that are no root
+    # one flat batch of the roots, unless they are known, and of next states that are no root
     rows = outside.reshape(-1).nonzero().squeeze(-1)
     steps, shape = outside.numel(), outside.shape
     root = root.reshape(-1)
@@ -96,7 +113,7 @@ def _evaluate_sequences(
     in_keys: list[NestedKey],
     out_keys: list[NestedKey],
 ) -> tuple[list[Tensor], list[Tensor]]:
-    """As :func:`evaluate_rollout`, for recurrent critics: T+1 states in order, and sequences of one state."""
+    """The same for recurrent critics: T+1 states in order, and sequences of one state."""
     time = root.batch_dims - 1
     end = _complete(following[..., -1:], root[..., -1:], in_keys)
     with set_recurrent_mode(True):
@@ -122,7 +139,7 @@ def _complete(following: TensorDictBase, root: TensorDictBase, in_keys: list[Nes
         at_root, at_next = root.get(key, None), following.get(key, None)
         if at_root is None:
             continue
-        if (key if isinstance(key, str) else key[-1]) == "is_init":
+        if _is_start_mark(key):
             # the step goes on from the root's hidden state, even where the root began an episode
             following.set(key, torch.zeros_like(at_root))
         elif at_next is None:
