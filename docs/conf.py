@@ -27,11 +27,11 @@ version = release = vusfa.__version__
 extensions = [
     "docstrings",
     "included",
+    "mathml",
     "pages",
     "myst_nb",
     "sphinx.ext.autodoc",
     "sphinx.ext.autosummary",
-    "sphinx.ext.mathjax",
     "sphinx.ext.napoleon",
     "sphinx_design",
 ]
@@ -40,6 +40,7 @@ exclude_patterns = ["_build", "generated", "README.md", "jupyter_execute"]
 html_static_path = ["_static"]
 
 # Pages
+highlight_language = "none"
 myst_enable_extensions = ["colon_fence", "dollarmath"]
 myst_heading_anchors = 3
 nb_execution_mode = os.environ.get("VUSFA_DOCS_EXECUTE", "cache")
@@ -67,6 +68,7 @@ python_maximum_signature_line_length = 88
 
 # Theme
 html_theme = "pydata_sphinx_theme"
+html_math_renderer = "mathml"
 html_title = f"vusfa {release}"
 html_css_files = ["site.css"]
 html_theme_options: dict[str, Any] = {

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import re
 import sys
 from collections.abc import Iterator
@@ -9,6 +10,7 @@ from typing import Any
 
 from sphinx.application import Sphinx
 from sphinx.pycode import ModuleAnalyzer
+from sphinx.util.inspect import stringify_signature
 
 __all__ = ["setup"]
 
@@ -66,8 +68,21 @@ def process(app: Sphinx, what: str, name: str, obj: Any, options: Any, lines: li
     lines[:] = [_SHAPE.sub(_escaped, line) for line in tables(lines)]
 
 
+def signature_of(
+    app: Sphinx, what: str, name: str, obj: Any, options: Any, signature: str | None, returned: str | None
+) -> tuple[str, str | None] | None:
+    """The parameters of ``__init__``, where a metaclass hides them (TorchRL's losses and environments)."""
+    if what not in ("class", "exception") or signature != "(*args, **kwargs)":
+        return None
+    found = inspect.signature(obj.__init__)
+    shown = found.replace(parameters=list(found.parameters.values())[1:])
+    text = stringify_signature(shown, show_return_annotation=False, unqualified_typehints=True)
+    return text, returned
+
+
 def setup(app: Sphinx) -> dict[str, Any]:
     """Register the rewriting."""
     app.setup_extension("sphinx.ext.autodoc")
     app.connect("autodoc-process-docstring", process, priority=400)
+    app.connect("autodoc-process-signature", signature_of)
     return {"parallel_read_safe": True, "parallel_write_safe": True}

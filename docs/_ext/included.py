@@ -1,12 +1,13 @@
 """Files that a page includes: a line that is nothing but a link to one becomes the file's text.
 
 On a plain view of the Markdown, as on GitHub, it stays the link. This holds for the tables in docs/generated
-and for the Markdown files beside docs.
+and for the Markdown files beside docs, whose links are then those of a page in docs.
 """
 
 from __future__ import annotations
 
 import re
+from pathlib import Path
 from typing import Any
 
 from sphinx.application import Sphinx
@@ -14,11 +15,19 @@ from sphinx.application import Sphinx
 __all__ = ["include_files", "setup"]
 
 _LINK = re.compile(r"^\[[^\]\n]+\]\((generated/[\w-]+\.md|\.\./[A-Z]+\.md)\)$", flags=re.MULTILINE)
+_BESIDE = re.compile(r"\]\(([A-Z]+)\.md\)")
 
 
 def include_files(app: Sphinx, page: str, source: list[str]) -> None:
     """Replace the links of one page, in place."""
-    source[0] = _LINK.sub(r"```{include} \1\n:relative-docs: docs/\n```", source[0])
+
+    def text(link: re.Match[str]) -> str:
+        path = Path(app.srcdir, link[1]).resolve()
+        app.env.note_dependency(str(path))
+        found = path.read_text(encoding="utf-8").replace("](docs/", "](")
+        return _BESIDE.sub(lambda name: f"]({name[1].lower()}.md)", found)
+
+    source[0] = _LINK.sub(text, source[0])
 
 
 def setup(app: Sphinx) -> dict[str, Any]:
