@@ -21,6 +21,8 @@ MAX_COMPRESSION = 200
 MAX_PICTURE_COMPRESSION = 1100
 #: Size of a chunk, which is read as a whole.
 MAX_CHUNK_BYTES = 1 << 28
+#: Texts and JPEG files of a scene.
+MAX_HEAP_OBJECTS = 1 << 17
 #: Datasets of at most this size need not keep to a compression.
 UNCOMPRESSED_BYTES = 1 << 26
 
@@ -57,6 +59,10 @@ MAX_NPZ_BYTES, MAX_NPZ_ELEMENTS = 1 << 28, 1 << 26
 
 # ---- archives (zip)
 
+#: Size of an archive that is fetched, and of a scene in it per state (THOR's dumps have half a megabyte).
+MAX_ARCHIVE_BYTES, MAX_STATE_BYTES = 1 << 35, 1 << 23
+#: Space on the disk that fetching leaves free.
+FREE_BYTES = 1 << 28
 #: Size of one read of a zip file: of its list of contents, which is read at once.
 MAX_ZIP_READ = 1 << 22
 

@@ -11,7 +11,7 @@ import zipfile
 import zlib
 from array import array
 from collections.abc import Collection, Iterable
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 import yaml
@@ -20,7 +20,16 @@ from vusfa import limits
 from vusfa.errors import ResultError, VusfaError
 from vusfa.limits import brief
 
-__all__ = ["BoundedZip", "parse_yaml", "read_csv", "read_json", "read_npz", "read_text", "read_yaml"]
+__all__ = [
+    "BoundedZip",
+    "parse_yaml",
+    "read_csv",
+    "read_json",
+    "read_npy",
+    "read_npz",
+    "read_text",
+    "read_yaml",
+]
 
 # What Python's parsers raise for damaged or hostile text, besides errors of their own.
 _PARSING = (ValueError, OverflowError, RecursionError)
@@ -182,24 +191,27 @@ class BoundedZip(zipfile.ZipFile):
                 raise zipfile.BadZipFile(f"its list of contents has more than {limits.MAX_ZIP_READ} bytes")
             return super().read(size)
 
+    _opened: _File | None = None
+
     def __init__(self, path: str | os.PathLike[str]) -> None:
         if os.path.exists(path) and not os.path.isfile(path):
             raise OSError("it is no regular file")
-        self._opened = self._File(io.FileIO(path))
+        self._opened = opened = self._File(io.FileIO(path))
         try:
-            super().__init__(self._opened)
-            self._opened.reads_contents = False
+            super().__init__(opened)
+            opened.reads_contents = False
             methods = {info.compress_type for info in self.infolist()}
             if methods - {zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED}:
                 raise zipfile.BadZipFile("it is compressed by another method than deflate")
         except BaseException:
-            self._opened.close()
+            opened.close()
             raise
 
     def close(self) -> None:
         """Close the archive and its file."""
         super().close()
-        self._opened.close()
+        if self._opened is not None:
+            self._opened.close()
 
 
 def read_npz(path: str | os.PathLike[str]) -> dict[str, np.ndarray]:
@@ -224,15 +236,43 @@ def read_npz(path: str | os.PathLike[str]) -> dict[str, np.ndarray]:
 
 
 def _array(file: zipfile.ZipFile, info: zipfile.ZipInfo) -> np.ndarray:
-    """One .npy member; its header is held against its size before the array is made."""
     content = io.BytesIO(file.read(info))
-    header = np.lib.format.read_array_header_1_0
-    if np.lib.format.read_magic(content) != (1, 0):
-        raise ValueError(f"{info.filename}: its version is not 1.0")
-    shape, column_major, dtype = header(content)
-    place = content.tell()
-    held = len(content.getbuffer()) - place
-    if dtype.kind not in "biufU" or min(shape, default=0) < 0 or dtype.itemsize * math.prod(shape) != held:
-        raise ValueError(f"{info.filename}: declares {dtype} of shape {brief(shape)} and holds {held} bytes")
-    flat = np.frombuffer(content.getbuffer(), dtype, offset=place)
+    try:
+        return _read_array(content, info.file_size)
+    except ValueError as error:
+        raise ValueError(f"{info.filename}: {error}") from error
+
+
+def _read_array(file: BinaryIO, size: int) -> np.ndarray:
+    """The array of a .npy file of ``size`` bytes, whose header is held against them first."""
+    try:
+        version = np.lib.format.read_magic(file)
+        header = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
+        shape, column_major, dtype = header[version](file)
+    except Exception as error:  # numpy's parser raises nearly anything for damaged bytes
+        raise ValueError(f"its header is damaged ({brief(str(error))})") from error
+    held = size - file.tell()
+    sound = dtype.kind in "biufU" and all(type(side) is int and side >= 0 for side in shape)
+    if not sound or dtype.itemsize * math.prod(shape) != held:
+        raise ValueError(f"declares {dtype} of shape {brief(shape)}, and holds {held} bytes")
+    flat = np.frombuffer(file.read(held), dtype)
     return flat.reshape(shape, order="F" if column_major else "C").copy()
+
+
+def read_npy(path: str | os.PathLike[str], error: type[VusfaError], mend: str) -> np.ndarray:
+    """The array of a .npy file: numbers, truth values or text, no pickles.
+
+    Args:
+        path: the file.
+        error: class of the exception, for whatever is wrong with the file.
+        mend: end of its message.
+    """
+    try:
+        if os.path.exists(path) and not os.path.isfile(path):
+            raise OSError("it is no regular file")
+        with open(path, "rb") as file:
+            return _read_array(file, os.fstat(file.fileno()).st_size)
+    except FileNotFoundError as fault:
+        raise error(f"{path}: cannot be read (there is no such file); {mend}") from fault
+    except (OSError, ValueError) as fault:
+        raise error(f"{path}: cannot be read ({fault}); {mend}") from fault

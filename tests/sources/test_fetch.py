@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import io
+import struct
 import threading
 import zipfile
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
+from types import SimpleNamespace
 
 import h5py
 import pytest
@@ -61,6 +64,9 @@ class Server:
         if mood.isdigit():
             request.send_error(int(mood))
             return
+        if mood in ("endless", "drip", "dripping head", "endless redirection"):
+            self.misbehave(request, mood)
+            return
         first = 0
         if self.ranges and wanted and request.headers.get("If-Range") == self.etag:
             first = int(wanted.removeprefix("bytes=").rstrip("-"))
@@ -92,6 +98,19 @@ class Server:
         self.sent += len(body)
         if mood in ("stall", "silent"):
             self.release.wait(5)
+
+    def misbehave(self, request: BaseHTTPRequestHandler, mood: str) -> None:
+        """Send something without an end, until nobody listens any more."""
+        request.send_response(302 if mood == "endless redirection" else 200)
+        request.send_header("Location", self.url)
+        if mood != "dripping head":
+            request.end_headers()
+        block = b"x" * (1 if "drip" in mood else 1 << 16)
+        with suppress(OSError):
+            request.wfile.write(b"X-Long: " if mood == "dripping head" else b"")
+            while not self.release.wait(0.02 if "drip" in mood else 0):
+                request.wfile.write(block)
+                self.sent += len(block)
 
 
 @pytest.fixture
@@ -237,6 +256,47 @@ def test_what_is_no_address_is_said_at_once(tmp_path: Path, url: str) -> None:
         download(url, tmp_path / "f", QUICK, sleep=lambda seconds: pytest.fail("waited"))
 
 
+@pytest.mark.parametrize("mood", ["drip", "dripping head"])
+def test_a_server_that_drips_is_given_up(serve: Callable, tmp_path: Path, mood: str) -> None:
+    server = serve(CONTENT)
+    server.mood = [mood]
+    with pytest.raises(SceneError, match=r"nothing arrives \(less than 65536 bytes in"):
+        download(server.url, tmp_path / "f", Patience(connect=0.2, silence=0.1, attempts=1, pause=0.01))
+
+
+def test_a_file_without_end_is_given_up(
+    serve: Callable, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("vusfa.sources.download.MAX_ARCHIVE_BYTES", 1 << 20)
+    server = serve(CONTENT)
+    server.mood = ["endless"]
+    with pytest.raises(SceneError, match=r"the file has more than 1048576 bytes; give another mirror"):
+        download(server.url, tmp_path / "f", QUICK)
+    assert hidden(tmp_path) == []
+
+
+def test_the_endless_body_of_a_redirection_is_not_read(serve: Callable, tmp_path: Path) -> None:
+    server = serve(CONTENT)
+    server.mood = ["endless redirection"]
+    download(server.url, tmp_path / "f", QUICK)
+    assert (tmp_path / "f").read_bytes() == CONTENT
+
+
+def test_redirections_in_a_circle(serve: Callable, tmp_path: Path) -> None:
+    server = serve(CONTENT)
+    server.mood = ["endless redirection"] * 40
+    with pytest.raises(SceneError, match="more than 10 redirections"):
+        download(server.url, tmp_path / "f", Patience(connect=2, silence=0.3, attempts=1, pause=0.01))
+
+
+def test_a_full_disk_is_said_before_the_transfer(
+    serve: Callable, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("shutil.disk_usage", lambda path: SimpleNamespace(free=(1 << 28) + 1000))
+    with pytest.raises(SceneError, match=r"1024000 bytes are to be written, and its disk has 268436456 free"):
+        download(serve(CONTENT).url, tmp_path / "f", QUICK)
+
+
 # ---- an archive of scenes
 
 
@@ -299,6 +359,33 @@ def test_the_next_mirror_is_asked(
     assert names(tmp_path / "out") == ["bathroom_02.h5", "kitchen_02.h5"]
     assert (len(bad.asked), len(good.asked)) == (1, 1)
     assert any(line.startswith(("thrown away", "failed")) for line in said)
+
+
+def huge(path: Path) -> None:
+    """A dataset of 14.6 TiB in a file of a few kilobytes."""
+    with h5py.File(path, "a") as file:
+        del file["resnet_feature"]
+        file.create_dataset("resnet_feature", (5, 800_000, 1_000_000), "f4", chunks=True)
+
+
+@pytest.mark.parametrize("trouble", ["declares terabytes", "bomb", "wrong member"])
+def test_an_archive_that_would_fill_the_machine_goes_and_the_next_mirror_is_asked(
+    serve: Callable, tmp_path: Path, rooms: dict[str, bytes], trouble: str
+) -> None:
+    room = tmp_path / "changed.h5"
+    room.write_bytes(rooms["bathroom_02"])
+    if trouble == "declares terabytes":
+        huge(room)
+    changed = bytes(5 * (1 << 23) + 1) if trouble == "bomb" else room.read_bytes()
+    content = packed({**rooms, "bathroom_02": changed})
+    if trouble == "wrong member":  # a size in the archive's list that is not that of the member
+        content = content.replace(struct.pack("<I", len(changed)), struct.pack("<I", len(changed) - 7))
+    out, said = tmp_path / "out", []
+    (good := serve(packed(rooms))).mood = []
+    fetch(described(serve(content).url, good.url), out, say=said.append)
+    assert names(out) == ["bathroom_02.h5", "kitchen_02.h5"]
+    assert any(line.startswith("thrown away") for line in said)
+    assert (out / "bathroom_02.h5").read_bytes() == rooms["bathroom_02"]
 
 
 @pytest.mark.parametrize("trouble", ["count", "graph", "distance", "missing", "no zip"])

@@ -283,7 +283,7 @@ def test_features_that_do_not_fit(tmp_path: Path) -> None:
         ("a.npy", "has 4 rows, but there are 5 states; write one for each"),
         ("flat.npy", r"holds float64 of shape \(4,\); write one array of numbers"),
         ("text.npy", "holds <U1 of shape"),
-        ("many.npz", "holds several arrays"),
+        ("many.npz", "its header is damaged"),
         ("junk.npy", "cannot be read"),
         ("gone.npy", "cannot be read"),
     ]:

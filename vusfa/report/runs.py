@@ -24,7 +24,10 @@ from vusfa.training import row_name
 __all__ = ["LoggedRun", "read_episodes", "read_run", "run_label", "split_name"]
 
 _EVALUATIONS = ("zero_shot", "evaluation")
+_A_RUN = "give the folder of a run of recipes/train.py"
 _AGAIN = "evaluate the run again with recipes/zero_shot.py"
+# What JSON of another content than ours ends in.
+_OTHER_CONTENT = (AttributeError, KeyError, OverflowError, TypeError, ValueError)
 _COLUMNS = ("goal", "start", "success", "length", "shortest", "collisions", "trained")
 
 
@@ -117,16 +120,20 @@ def read_run(source: str | Path) -> LoggedRun:
     label, folder = split_name(source)
     if not folder.is_dir():
         raise ConfigError(f"{folder} is not a folder; give the folder of a run of recipes/train.py")
-    settings = read_json(folder / "config.json", ConfigError, "give the folder of a run of recipes/train.py")
+    settings = read_json(folder / "config.json", ConfigError, _A_RUN)
     if not isinstance(settings.get("agent"), Mapping) or "model" not in settings["agent"]:
         raise ConfigError(
             f"{folder / 'config.json'}: field 'agent.model' is missing; it is no run's settings"
         )
+    try:
+        label, seed = label or run_label(settings), int(settings.get("seed", 0))
+    except _OTHER_CONTENT as error:
+        raise ConfigError(f"{folder / 'config.json'}: is no run's settings ({error!r}); {_A_RUN}") from error
     log, checkpoint = folder / "metrics.csv", folder / "checkpoint.pt"
     episodes, references, variant = _evaluation(folder)
     return LoggedRun(
-        label or run_label(settings),
-        int(settings.get("seed", 0)),
+        label,
+        seed,
         folder,
         settings,
         read_metrics(log) if log.is_file() else {},
@@ -199,11 +206,15 @@ def _evaluation(folder: Path) -> tuple[Episodes | None, list[dict[str, Any]], st
         if not table.is_file() or not summary.is_file():
             continue
         content = read_json(summary, ConfigError, _AGAIN)
-        settings, rows = content.get("settings", {}), content.get("rows", [])
-        episodes = read_episodes(table, int(settings.get("max_steps", MAX_STEPS)))
-        own = rows[0]["policy"] if rows else ""
-        others = [_with_nan(row) for row in rows if row["policy"] != own]
-        variant = "sampled" if settings.get("sample", True) else "greedy"
+        try:
+            settings, rows = content.get("settings", {}), content.get("rows", [])
+            max_steps = int(settings.get("max_steps", MAX_STEPS))
+            own = rows[0]["policy"] if rows else ""
+            others = [_with_nan(row) for row in rows if row["policy"] != own]
+            variant = "sampled" if settings.get("sample", True) else "greedy"
+        except _OTHER_CONTENT as error:
+            raise ConfigError(f"{summary}: is no evaluation ({error!r}); {_AGAIN}") from error
+        episodes = read_episodes(table, max_steps)
         num_goals = int(torch.stack([episodes.scene, episodes.goal]).unique(dim=1).shape[1])
         found.append((num_goals, episodes, others, variant))
     if not found:

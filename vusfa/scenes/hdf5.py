@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import mmap
 import uuid
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -15,7 +16,7 @@ import numpy as np
 from vusfa import limits
 from vusfa.errors import SceneError
 
-__all__ = ["dataset_in", "opened", "plain", "replaced"]
+__all__ = ["check_heaps", "dataset_in", "opened", "plain", "replaced"]
 
 
 @contextmanager
@@ -38,6 +39,31 @@ def opened(path: Path) -> Iterator[h5py.File]:
             f"{path}: cannot be read as HDF5 ({error}); the file is truncated, damaged or something else:"
             f" copy it or make it again"
         ) from error
+
+
+def check_heaps(path: Path) -> None:
+    """Check the global heaps of a file, where text and JPEG files lie: HDF5 itself never returns from one that was
+    overwritten with zeros (its library, up to version 2.0, takes a free object of size 0 for a step forwards).
+
+    Raises:
+        SceneError: a heap is damaged.
+    """
+    objects = 0
+    with open(path, "rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
+        heap = data.find(b"GCOL")
+        while heap >= 0:
+            end = heap + int.from_bytes(data[heap + 8 : heap + 16], "little")
+            place = heap + 16
+            while place + 16 <= end <= len(data):
+                size = int.from_bytes(data[place + 8 : place + 16], "little")
+                step = 16 + (size + 7) // 8 * 8 if any(data[place : place + 2]) else size
+                objects += 1
+                if step == 0 or objects > limits.MAX_HEAP_OBJECTS:
+                    raise SceneError(
+                        f"{path}: the heap at byte {heap} is damaged; copy the file or make it again"
+                    )
+                place += step
+            heap = data.find(b"GCOL", heap + 4)
 
 
 @contextmanager

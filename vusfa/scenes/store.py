@@ -26,7 +26,7 @@ import numpy as np
 from vusfa.deprecated import moved_names
 from vusfa.errors import SceneError
 from vusfa.scenes import pictures as picture_files
-from vusfa.scenes.hdf5 import dataset_in, opened, plain, replaced
+from vusfa.scenes.hdf5 import check_heaps, dataset_in, opened, plain, replaced
 from vusfa.scenes.validation import DATASETS, array_faults
 
 __all__ = ["Dump", "bundled_names", "bundled_path", "read", "validate", "write"]
@@ -94,6 +94,7 @@ def read(path: str | os.PathLike[str]) -> Dump:
     """
     path = Path(path)
     with opened(path) as file:
+        check_heaps(path)
         attributes = {key: plain(value) for key, value in file.attrs.items()}
         dump = Dump(name=str(attributes.pop("scene", path.stem)))
         if "actions" in attributes:

@@ -8,17 +8,26 @@ still the same (``If-Range``); a server that knows neither sends all of it again
 from __future__ import annotations
 
 import json
+import queue
+import shutil
+import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Generator
+from contextlib import closing, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+from urllib.parse import urljoin
 
 from vusfa.errors import ConfigError, SceneError
+from vusfa.limits import FREE_BYTES, MAX_ARCHIVE_BYTES
+from vusfa.reading import read_json
 
-__all__ = ["Patience", "download"]
+__all__ = ["Patience", "download", "require_space"]
 
 _BLOCK = 1 << 16
+_PROGRESS = 1 << 12  # bytes that an attempt must bring to count as one that brought something
+_MAX_REDIRECTS = 10
 
 
 @dataclass(frozen=True)
@@ -27,7 +36,8 @@ class Patience:
 
     Args:
         connect: seconds until it must answer.
-        silence: seconds without a byte after which a transfer has stalled.
+        silence: seconds without a byte after which a transfer has stalled; so has one of less than 64 KiB in
+            twice that time.
         attempts: tries at one address that bring nothing new, after which the next address is asked.
         pause: seconds before the second try, doubled before every further one.
     """
@@ -73,7 +83,7 @@ def download(
             raise SceneError(f"{url}: is no address ({error}); give one like http://host/file.zip") from error
         except requests.RequestException as error:
             # A transfer that breaks off after every few megabytes still gets there.
-            failures = 1 if part.size > before else failures + 1
+            failures = 1 if part.size >= before + _PROGRESS else failures + 1
             if failures >= patience.attempts:
                 raise SceneError(
                     f"{url}: nothing arrives ({_why(error)}), {patience.attempts} times; try again later,"
@@ -109,10 +119,11 @@ class _Part:
     def validator(self, url: str) -> str | None:
         """The ETag or date under which the server gave these bytes; None when they cannot be added to."""
         try:
-            note = json.loads(self._note.read_text())
-        except (OSError, ValueError):
+            note = read_json(self._note, SceneError, "fetch it again")
+        except SceneError:
             return None
-        return note.get("validator") if note.get("url") == url and self.size else None
+        validator = note.get("validator") if note.get("url") == url and self.size else None
+        return validator if isinstance(validator, str) else None
 
     def begin(self, url: str, validator: str | None) -> None:
         """Start from nothing."""
@@ -142,8 +153,8 @@ def _transfer(
     headers = {"Accept-Encoding": "identity"}
     if validator is not None:
         headers |= {"Range": f"bytes={part.size}-", "If-Range": validator}
-    limits = (patience.connect, patience.silence)
-    with requests.get(url, headers=headers, stream=True, timeout=limits) as answer:
+    with closing(_received(requests, url, headers, patience)) as stream:
+        answer = next(stream)
         if answer.status_code == 416:  # beyond the end: what lies here is not what lies there
             part.discard()
             raise requests.ConnectionError("the server has another file now")
@@ -151,22 +162,108 @@ def _transfer(
             raise requests.ConnectionError(f"the server answers {answer.status_code}")
         if answer.status_code not in (200, 206):
             raise _Refused(f"the server answers {answer.status_code} {answer.reason}")
+        if answer.headers.get("Content-Encoding", "identity") != "identity":
+            raise _Refused("the server sends it compressed, unasked")
         if answer.status_code == 200 or not _goes_on(answer, part.size):
             if answer.status_code == 206:
                 part.discard()
                 raise requests.ConnectionError("the server sent another part than was asked for")
             part.begin(url, _validator(answer))
-        length = answer.headers.get("Content-Length")
-        total = part.size + int(length) if length and length.isdigit() else 0
+        length = answer.headers.get("Content-Length", "")
+        total = part.size + int(length) if length.isdecimal() and len(length) < 20 else 0
         done = part.size
+        require_space(part.path.parent, total - done if total else 0)
         progress(done, total)
         with open(part.path, "ab") as file:
-            for block in answer.iter_content(_BLOCK):
+            for number, block in enumerate(stream):
                 file.write(block)
                 done += len(block)
+                if max(done, total) > MAX_ARCHIVE_BYTES:
+                    part.discard()
+                    raise _Refused(f"the file has more than {MAX_ARCHIVE_BYTES} bytes")
+                if number % 256 == 0:
+                    require_space(part.path.parent, 0)
                 progress(done, total)
         if total and done != total:
             raise requests.ConnectionError(f"the connection ended after {done} of {total} bytes")
+
+
+def require_space(folder: Path, size: int) -> None:
+    """Refuse to write so many bytes into a folder whose disk would be full then.
+
+    Raises:
+        SceneError: there is less space than that and :data:`vusfa.limits.FREE_BYTES`.
+    """
+    free = shutil.disk_usage(folder).free
+    if size + FREE_BYTES > free:
+        raise SceneError(
+            f"{folder}: {size} bytes are to be written, and its disk has {free} free; make space, leaving"
+            f" {FREE_BYTES}, or give another folder"
+        )
+
+
+def _received(
+    requests: Any, url: str, headers: dict[str, str], patience: Patience
+) -> Generator[Any, None, None]:
+    """The answer, then the blocks of its body.
+
+    They come through a thread: a server that sends a byte now and then, in headers or body, keeps that thread
+    waiting and nobody else.
+    """
+    arrived: queue.Queue[Any] = queue.Queue(maxsize=8)
+    given_up = threading.Event()
+
+    def put(item: Any) -> None:
+        while not given_up.is_set():
+            with suppress(queue.Full):
+                return arrived.put(item, timeout=0.1)
+
+    def receive() -> None:
+        try:
+            with _get(requests, url, headers, patience) as answer:
+                put(answer)
+                for block in answer.iter_content(_BLOCK):
+                    put(block)
+                    if given_up.is_set():
+                        return
+            put(None)
+        except Exception as error:
+            put(error)
+
+    threading.Thread(target=receive, daemon=True).start()
+    window = patience.connect + 2 * patience.silence
+    begun, received = time.monotonic(), 0
+    try:
+        while True:
+            item = arrived.get(timeout=max(0.0, begun + window - time.monotonic()))
+            if isinstance(item, Exception):
+                raise item
+            if item is None:
+                return
+            yield item
+            received += len(item) if isinstance(item, bytes) else _BLOCK
+            if received >= _BLOCK:
+                begun, received, window = time.monotonic(), 0, 2 * patience.silence
+    except queue.Empty as error:
+        raise requests.Timeout(f"less than {_BLOCK} bytes in {window:g} s") from error
+    finally:
+        given_up.set()
+
+
+def _get(requests: Any, url: str, headers: dict[str, str], patience: Patience) -> Any:
+    """The answer at the end of redirections. The bodies of those, which requests would read as a whole, are
+    left alone."""
+    session = requests.Session()
+    target = session.get_redirect_target
+    session.get_redirect_target = lambda answer: None
+    for _ in range(_MAX_REDIRECTS):
+        answer = session.get(url, headers=headers, stream=True, timeout=(patience.connect, patience.silence))
+        place = target(answer)
+        if not place:
+            return answer
+        answer.close()
+        url = urljoin(url, place)
+    raise requests.TooManyRedirects(f"more than {_MAX_REDIRECTS} redirections")
 
 
 def _goes_on(answer: Any, have: int) -> bool:

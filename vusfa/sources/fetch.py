@@ -12,19 +12,17 @@ import os
 import shutil
 import time
 import uuid
-import zipfile
-import zlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, fields
 from pathlib import Path, PurePosixPath
-from typing import Any
+from typing import IO, Any
 
 from vusfa.errors import ConfigError, SceneError
-from vusfa.limits import brief
-from vusfa.reading import read_yaml
+from vusfa.limits import MAX_STATE_BYTES, brief
+from vusfa.reading import BoundedZip, read_yaml
 from vusfa.scenes import store
 from vusfa.scenes.hdf5 import opened
-from vusfa.sources.download import Patience, download
+from vusfa.sources.download import Patience, download, require_space
 
 __all__ = ["Archive", "archives", "arrived_faults", "fetch"]
 
@@ -177,12 +175,12 @@ class _Unsound(Exception):
 
 
 def _admit(packed: Path, archive: Archive, targets: dict[str, Path]) -> None:
-    """Unpack into a folder of its own, look at everything, then move all scenes at once."""
+    """Unpack into a folder of its own, check everything, then move all scenes at once."""
     workshop = packed.with_name(f".{packed.name}.{uuid.uuid4().hex}")
     try:
         workshop.mkdir()
         unpacked = {name: workshop / f"{name}.h5" for name in archive.scenes}
-        _unpack(packed, unpacked)
+        _unpack(packed, unpacked, archive.scenes)
         for name, path in unpacked.items():
             faults = arrived_faults(path, archive.scenes[name])
             if faults:
@@ -196,15 +194,34 @@ def _admit(packed: Path, archive: Archive, targets: dict[str, Path]) -> None:
         shutil.rmtree(workshop, ignore_errors=True)
 
 
-def _unpack(packed: Path, targets: dict[str, Path]) -> None:
+def _unpack(packed: Path, targets: dict[str, Path], scenes: dict[str, int]) -> None:
     """Files of a zip archive by their last name, wherever they lie in it."""
     try:
-        with zipfile.ZipFile(packed) as file:
-            members = {PurePosixPath(name).name: name for name in file.namelist() if "__MACOSX" not in name}
-            for name, path in targets.items():
+        with BoundedZip(packed) as file:
+            listed = [info for info in file.infolist() if "__MACOSX" not in info.filename]
+            members = {PurePosixPath(info.filename).name: info for info in listed}
+            for name, states in scenes.items():
                 if f"{name}.h5" not in members:
                     raise _Unsound(f"{packed.name} has no {name}.h5")
-                with file.open(members[f"{name}.h5"]) as source, open(path, "wb") as copy:
-                    shutil.copyfileobj(source, copy, 1 << 20)
-    except (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError) as error:
+                size, most = members[f"{name}.h5"].file_size, states * MAX_STATE_BYTES
+                if size > most:
+                    raise _Unsound(f"{name}.h5 has {size} bytes; at most {most} are read for {states} states")
+            require_space(packed.parent, sum(members[f"{name}.h5"].file_size for name in scenes))
+            for name, path in targets.items():
+                with file.open(members[f"{name}.h5"]) as source:
+                    _copy(source, path)
+    except (_Unsound, SceneError):
+        raise
+    except Exception as error:  # zipfile raises nearly anything for damaged bytes
         raise _Unsound(f"{packed.name} is no whole zip file ({error})") from error
+
+
+def _copy(source: IO[bytes], path: Path) -> None:
+    """Copy a member; what goes wrong in writing is no fault of the archive."""
+    path.touch()
+    while block := source.read(1 << 20):
+        try:
+            with open(path, "ab") as copy:
+                copy.write(block)
+        except OSError as error:
+            raise SceneError(f"{path}: cannot be written ({error}); check space and rights") from error

@@ -11,13 +11,13 @@ import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from zipfile import BadZipFile
 
 import numpy as np
 from PIL import Image, ImageOps
 
 from vusfa.errors import SceneError
 from vusfa.limits import MAX_PHOTO_PIXELS
+from vusfa.reading import read_npy
 from vusfa.scenes.graph import default_actions
 from vusfa.scenes.pictures import open_image, to_jpeg
 from vusfa.scenes.validation import raise_faults
@@ -207,17 +207,12 @@ def read_features(path: str | os.PathLike[str], num_states: int) -> np.ndarray:
     Raises:
         SceneError: the file is missing or is none, or its shape does not fit.
     """
-    try:
-        if not Path(path).is_file():
-            raise OSError("it is no regular file")
-        values = np.load(path, mmap_mode="r", allow_pickle=False)  # held against the file's size
-    except (OSError, ValueError, EOFError, OverflowError, RecursionError, SyntaxError, BadZipFile) as error:
-        raise SceneError(f"{path}: cannot be read ({error}); write it with numpy.save") from error
-    if not isinstance(values, np.ndarray) or values.dtype.kind not in "fiu" or values.ndim not in (2, 3):
-        held = (
-            f"{values.dtype} of shape {values.shape}" if isinstance(values, np.ndarray) else "several arrays"
+    values = read_npy(path, SceneError, "write it with numpy.save")
+    if values.dtype.kind not in "fiu" or values.ndim not in (2, 3):
+        raise SceneError(
+            f"{path}: holds {values.dtype} of shape {values.shape}; write one array of numbers, (N, F) or"
+            f" (N, C, F)"
         )
-        raise SceneError(f"{path}: holds {held}; write one array of numbers, (N, F) or (N, C, F)")
     if len(values) != num_states:
         raise SceneError(
             f"{path}: has {len(values)} rows, but there are {num_states} states; write one for each, in the"
