@@ -157,6 +157,20 @@ def test_pictures_of_one_color_are_read_whatever_their_size(make_file: Make) -> 
     assert validate(path) == []
 
 
+@pytest.mark.parametrize("length", [16, 400])
+def test_zeros_in_the_heap_of_texts_and_pictures(make_file: Make, length: int) -> None:
+    """A block that never reached the disk; HDF5 itself would not return."""
+    path = make_file(attributes={"licences": ["CC0", "CC BY"], "credits": "somebody" * 30})
+    with h5py.File(path, "a") as file:
+        file.attrs.create("more", ["a", "b"], dtype=h5py.string_dtype())
+    content = path.read_bytes()
+    first = content.index(b"GCOL") + 16
+    path.write_bytes(content[:first] + bytes(length) + content[first + length :])
+    assert validate(path) == [f"{path}: is damaged at byte {first}; copy the file or make it again"]
+    with pytest.raises(SceneError, match="is damaged at byte"):
+        Scene.load(path)
+
+
 def test_chunks_are_bounded(make_file: Make, pictures: np.ndarray, monkeypatch: pytest.MonkeyPatch) -> None:
     path = make_file()
     with h5py.File(path, "a") as file:

@@ -42,8 +42,9 @@ def opened(path: Path) -> Iterator[h5py.File]:
 
 
 def check_heaps(path: Path) -> None:
-    """Check the global heaps of a file, where text and JPEG files lie: HDF5 itself never returns from one that was
-    overwritten with zeros (its library, up to version 2.0, takes a free object of size 0 for a step forwards).
+    """Check the global heaps of a file, which hold text and JPEG files.
+
+    The HDF5 library, up to version 2.0 at least, never returns from a heap that was overwritten with zeros.
 
     Raises:
         SceneError: a heap is damaged.
@@ -59,9 +60,7 @@ def check_heaps(path: Path) -> None:
                 step = 16 + (size + 7) // 8 * 8 if any(data[place : place + 2]) else size
                 objects += 1
                 if step == 0 or objects > limits.MAX_HEAP_OBJECTS:
-                    raise SceneError(
-                        f"{path}: the heap at byte {heap} is damaged; copy the file or make it again"
-                    )
+                    raise SceneError(f"{path}: is damaged at byte {place}; copy the file or make it again")
                 place += step
             heap = data.find(b"GCOL", heap + 4)
 

@@ -132,7 +132,7 @@ def validate(path: str | os.PathLike[str]) -> list[str]:
     except SceneError as error:
         return [str(error)]
     faults = [f"{path}: {fault}" for fault in dump.faults()]
-    if dump.picture_shape is not None and "graph" in dump.arrays:
+    if dump.picture_shape is not None and "graph" in dump.arrays and dump.arrays["graph"].ndim:
         faults += picture_files.picture_faults(path, len(dump.arrays["graph"]))
     return faults
 
