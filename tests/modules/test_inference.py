@@ -1,14 +1,18 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import nullcontext
 
 import pytest
 import torch
 from tensordict import TensorDict
 from tensordict.nn import InteractionType
 from torch.distributions import Categorical
+from torchrl.envs import Compose, TransformedEnv
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
+from vusfa.envs import TargetNavEnv
+from vusfa.errors import ConfigError
 from vusfa.modules import (
     ARCHITECTURES,
     MODELS,
@@ -19,6 +23,7 @@ from vusfa.modules import (
     draw_actions,
 )
 from vusfa.modules.rows import SceneBlocks, SortedByScene
+from vusfa.scenes import SceneSet
 
 MakeAgent = Callable[..., Agent]
 MakeBatch = Callable[..., TensorDict]
@@ -82,9 +87,31 @@ def test_weights_are_the_agents_own(small_agent: MakeAgent, make_batch: MakeBatc
     assert bool((policy(data)["action"] == 2).all())
 
 
-def test_an_agent_with_a_memory_is_refused(small_agent: MakeAgent) -> None:
-    with pytest.raises(ValueError, match="get_policy_operator"):
-        InferencePolicy(small_agent("vusfa", memory="lstm"))
+@pytest.mark.parametrize("batch", [[], [6], [2, 3]], ids=str)
+def test_an_agent_with_a_memory_walks_alike(
+    small_agent: MakeAgent, scenes: SceneSet, batch: list[int]
+) -> None:
+    agent = small_agent("vusfa", memory="lstm")
+    env = TargetNavEnv(scenes, goals=[2, 9], batch_size=batch, history=1, max_steps=4, seed=0)
+    env = TransformedEnv(env, Compose(*agent.make_env_transforms()))
+    policy, walks = InferencePolicy(agent), []
+    for context, one in (
+        (nullcontext(), agent.get_policy_operator(["action"])),
+        (nullcontext(), policy),
+        (policy.cached(torch.tensor([2, 9])), policy),
+    ):
+        with context, torch.no_grad():
+            env.set_seed(0)
+            torch.manual_seed(0)
+            walks.append(env.rollout(12, one, break_when_any_done=False))
+    assert walks[0]["next", "done"].any()
+    for walk in walks[1:]:
+        assert set(walk.keys(True)) == set(walks[0].keys(True))
+        assert torch.equal(walk["action"], walks[0]["action"])
+        for key in ("recurrent_state_h", "recurrent_state_c"):
+            torch.testing.assert_close(walk["next", key], walks[0]["next", key])
+    with pytest.raises(ConfigError, match=r"reads 'is_init'; give the environment agent.make_env_transforms"):
+        policy(env.base_env.reset())
 
 
 class TestDraws:

@@ -93,7 +93,7 @@ def _expected(trainer: Trainer) -> tuple[float, float, float]:
 def _walked(trainer: Trainer, episodes_per_goal: int) -> tuple[float, float, float]:
     """The same of any other: of episodes that are walked."""
     table = evaluate(
-        trainer.actor if trainer.agent.memory is not None else InferencePolicy(trainer.agent),
+        InferencePolicy(trainer.agent),
         trainer.scenes,
         trainer.goals,
         episodes_per_goal=episodes_per_goal,

@@ -81,7 +81,7 @@ def evaluation_policy(agent: Agent, scenes: SceneSet | None = None) -> TensorDic
     """
     if scenes is not None and agent.is_tabular:
         return TabularPolicy(agent, scenes)
-    return InferencePolicy(agent) if agent.memory is None else agent.get_policy_operator(out_keys=["action"])
+    return InferencePolicy(agent)
 
 
 def evaluation_precision(agent: Agent, config: Mapping[str, Any]) -> AbstractContextManager[Any]:

@@ -38,8 +38,7 @@ def make_agent(model: str, architecture: str = "controlled", scenes: Any = None,
     """Build one of the models.
 
     Args:
-        model: ``"gvf"`` (Zhu et al. 2017), ``"usfa"``, ``"sfdp"`` or ``"vusfa"``, or the name of a
-            :func:`~vusfa.modules.register_model`.
+        model: ``"gvf"`` (Zhu et al. 2017), ``"usfa"``, ``"sfdp"``, ``"vusfa"``, or a registered name.
         architecture: ``"controlled"`` (the models differ only in the named ideas), ``"paper"`` (the text) or
             ``"reference"`` (the released code with its quirks).
         scenes: the :class:`vusfa.scenes.SceneSet` to live in; it gives the features, and one head per scene
@@ -74,8 +73,8 @@ def make_agent(model: str, architecture: str = "controlled", scenes: Any = None,
 class Agent(nn.Module):
     """One model: its layers, and the actor and critic made of them.
 
-    Actor and critic are built of the SAME TensorDictModule objects where they agree (encoder, fusion,
-    scene layer, psi), so that a loss that recognises them runs the trunk once.
+    Actor and critic are built of the same TensorDictModule objects where they agree (encoder, fusion, scene
+    layer, psi), so that a loss that recognizes them runs the trunk once.
 
     | key | shape | written by |
     |---|---|---|
@@ -94,8 +93,7 @@ class Agent(nn.Module):
         scenes: a ``SceneSet``.
 
     Attributes:
-        config: plain dict of names, numbers and lists: ``make_agent`` rebuilds the agent from it and the
-            scenes.
+        config: plain dict, from which ``make_agent`` rebuilds the agent in the same scenes.
     """
 
     def __init__(self, config: AgentConfig, scenes: Any) -> None:
@@ -156,7 +154,7 @@ class Agent(nn.Module):
         return successor, RewardHead(size, hidden, config.reward_scale), SuccessorValue()
 
     def make_policy(self, config: AgentConfig, num_actions: int) -> nn.Module:
-        """Logits of the hidden state and, where :meth:`policy_keys` name more, of that."""
+        """Logits of what :meth:`policy_keys` name."""
         plain = PolicyHead(self.num_scenes, config.hidden_size, num_actions)  # drawn by all: seeds stay equal
         if not config.ideas.successor_policy:
             return plain
@@ -174,7 +172,7 @@ class Agent(nn.Module):
         return ["hidden", *(["successor_features"] if config.ideas.successor_policy else []), "scene_id"]
 
     def make_steps(self, config: AgentConfig) -> dict[str, Step]:
-        """Name to step: each layer with the entries that it reads and writes, in the order of computation."""
+        """The layers by name, in the order of computation, with the entries that they read and write."""
         read = (
             ["state_id", "goal_id"] if config.observation == "index" else ["observation", "goal_observation"]
         )
@@ -201,11 +199,11 @@ class Agent(nn.Module):
         return steps
 
     def actor_steps(self) -> list[Step]:
-        """Steps from observations to ``logits``: those that the policy needs, and no other."""
+        """Steps that lead from observations to ``logits``."""
         return self._steps_to("logits")
 
     def critic_steps(self) -> list[Step]:
-        """Steps from observations to ``state_value``."""
+        """Steps that lead from observations to ``state_value``."""
         return self._steps_to("state_value")
 
     def _steps_to(self, key: str) -> list[Step]:

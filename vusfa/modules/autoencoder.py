@@ -1,4 +1,4 @@
-"""phi of a pretrained autoencoder: it suffices to say what was seen, whatever is rewarded."""
+"""phi of a pretrained autoencoder, which depends on no reward."""
 
 from __future__ import annotations
 
@@ -13,11 +13,7 @@ __all__ = ["explained_features", "pretrain_autoencoder"]
 
 
 def explained_features(made: Tensor, features: Tensor) -> float:
-    """Share of the features' variance over states that a reconstruction explains; 1 where it is perfect, 0
-    where the mean would do as well.
-
-    Args:
-        made, features: (S, F).
+    """Share of the variance of features (S, F) over states that a reconstruction (S, F) explains, at most 1.
 
     >>> explained_features(torch.tensor([[0.0], [2.0], [4.0]]), torch.tensor([[0.0], [2.0], [6.0]]))
     0.7857142686843872
@@ -29,16 +25,16 @@ def explained_features(made: Tensor, features: Tensor) -> float:
 def pretrain_autoencoder(
     agent: Agent, *, steps: int = 2000, batch_size: int = 256, lr: float = 1e-3, seed: int = 0
 ) -> float:
-    r"""Train an agent's encoder, with a linear decoder that is then thrown away, to say what it saw.
+    r"""Train an agent's encoder to reconstruct features, with a linear decoder that is then thrown away.
 
     .. math:: \min_{\phi, W} \; E_s \lVert W \phi(s) - x(s) \rVert^2
 
     over all states of the agent's scenes, x(s) the features of the frame (normalized, where the agent
-    normalizes them) and phi(s) the ``state_embedding`` of a history that holds it alone. The encoder's
-    weights are constants afterwards, as in every agent with ``pretrained="autoencoder"``.
+    normalizes them) and phi(s) the ``state_embedding`` of a history of that frame alone. Afterwards the
+    encoder's weights are constants.
 
     Args:
-        agent: its encoder is changed.
+        agent: made with ``pretrained="autoencoder"``; its encoder is changed.
         steps: of Adam, with a learning rate that falls linearly to 0.
         batch_size: states per step.
         lr: learning rate at the start.

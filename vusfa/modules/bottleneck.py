@@ -1,7 +1,6 @@
-"""The variational siamese bottleneck: embeddings become Gaussians, and omega reads a sample of the goal's.
+"""Variational siamese bottleneck: embeddings are Gaussians, and omega reads a sample of the goal's.
 
-The encoder gives mean and scale of z for state and goal. pi and psi read the means; omega reads z_g = mean
-+ scale * eps while training. How much z may say is held by the KL term of :class:`vusfa.objectives.USFLoss`.
+pi and psi read the means. The KL term of :class:`vusfa.objectives.USFLoss` limits what z may say.
 """
 
 from __future__ import annotations
@@ -25,18 +24,13 @@ def gaussian_kl(loc: Tensor, scale: Tensor, eps: float = 1e-8) -> Tensor:
     .. math::
         \tfrac12 \left(\mu^2 + \sigma^2 - \log(\sigma^2 + \epsilon) - 1\right)
 
-    Only the scale's square counts, so that a network's plain linear output, of either sign, may be the scale.
-
     Args:
-        loc: mean, any shape.
-        scale: standard deviation, the same shape.
+        loc: mean, any shape; that of the result, too.
+        scale: standard deviation, the same shape; of either sign, for only its square counts.
         eps: keeps the logarithm finite at scale 0.
 
-    Returns:
-        the shape of ``loc``.
-
     Raises:
-        ValueError: when the shapes differ.
+        ValueError: the shapes differ.
 
     >>> gaussian_kl(torch.tensor([0.0, 2.0]), torch.tensor([1.0, -1.0]))
     tensor([0., 2.])
@@ -55,10 +49,9 @@ class GaussianBottleneck(nn.Module):
     """A code of size 2 E as the mean and the scale of a Gaussian of size E.
 
     Args:
-        scale: ``"softplus"``: ``softplus`` of the code's second half, positive. ``"raw"``: the second half
-            itself, of either sign, as in the released code.
-        initial_scale: scale at the start, set by the bias of the layer that makes the code; ``"softplus"``
-            only. ``None`` leaves the bias as it is drawn: near log 2.
+        scale: ``"softplus"`` of the code's second half; or ``"raw"``: that half, as in the released code.
+        initial_scale: scale at the start, set by the bias of the layer that makes the code (``"softplus"``
+            only); ``None`` leaves the bias as it is drawn: near log 2.
 
     Raises:
         ConfigError: ``initial_scale`` with ``"raw"``, or not positive.
@@ -99,8 +92,7 @@ class GaussianBottleneck(nn.Module):
 class LatentSampler(nn.Module):
     """z = mean + scale * eps while training; in evaluation mode the mean, or a sample if asked for.
 
-    Deliberately a plain module and no distribution of TorchRL's: its losses switch every distribution to
-    its mean.
+    It is no distribution of TorchRL's, whose losses switch every distribution to its mean.
 
     Args:
         eval_latent: what evaluation mode gives, ``"mean"`` or ``"sample"``.
@@ -117,7 +109,7 @@ class LatentSampler(nn.Module):
         self.eval_latent = eval_latent
 
     def noise(self, loc: Tensor) -> Tensor:
-        """Draws eps, standard normal of the mean's shape, from torch's global generator."""
+        """Draw eps, standard normal of the mean's shape, from torch's global generator."""
         return torch.randn(loc.shape, dtype=loc.dtype, device=loc.device)
 
     def forward(self, loc: Tensor, scale: Tensor) -> Tensor:

@@ -1,8 +1,4 @@
-"""Models and architectures: two tables, and the class of settings that they fill.
-
-Models differ in three named ideas (:data:`MODELS`). Everything else is a field of :class:`AgentConfig`, which
-an architecture sets (:data:`ARCHITECTURES`) and ``make_agent(..., field=value)`` overrides.
-"""
+"""Models, which differ in three ideas, and architectures, which set the fields of :class:`AgentConfig`."""
 
 from __future__ import annotations
 
@@ -13,25 +9,17 @@ from typing import Any, Literal, NamedTuple
 
 from vusfa.errors import ConfigError
 
-__all__ = [
-    "ARCHITECTURES",
-    "MODELS",
-    "AgentConfig",
-    "Model",
-    "register_model",
-    "resolve_config",
-]
+__all__ = ["ARCHITECTURES", "MODELS", "AgentConfig", "Model", "register_model", "resolve_config"]
 
 
 class Model(NamedTuple):
-    """The ideas that a model has.
+    """The ideas of a model.
 
     Attributes:
         successor_value: V = psi . omega instead of a linear value head.
         successor_policy: SFDP: the policy reads (detached) psi too.
         bottleneck: embeddings are Gaussians, omega reads a sample of the goal's.
-        agent: what builds it from its configuration and scenes, a subclass of
-            :class:`~vusfa.modules.Agent`; None for that class itself.
+        agent: subclass of :class:`~vusfa.modules.Agent` that builds it; None for that class itself.
     """
 
     successor_value: bool
@@ -49,11 +37,10 @@ MODELS: dict[str, Model] = {
     "vusfa": Model(True, True, True),
 }
 
-#: What an architecture sets, for all models (``"*"``) and then for one. What it leaves out has AgentConfig's
-#: default.
+#: What an architecture sets, for all models (``"*"``) and then for one; else AgentConfig's default holds.
 ARCHITECTURES: dict[str, dict[str, dict[str, Any]]] = {
-    # The four models differ only in the ideas of MODELS, so that an ablation means something.
-    # The five settings below are none of the paper's: with them all four models learn (docs/training.md).
+    # The four models differ only in the ideas of MODELS. The five settings below are none of the paper's: with
+    # them all four models learn (docs/training.md).
     "controlled": {
         "*": {
             "normalize_features": True,
@@ -64,8 +51,8 @@ ARCHITECTURES: dict[str, dict[str, dict[str, Any]]] = {
         },
         "vusfa": {"initial_scale": 0.1},
     },
-    # The paper's text. The GVF baseline is Zhu et al.'s, whose encoder is one layer. The text does not say
-    # how a scale is made; softplus keeps it positive.
+    # The paper's text, which does not say how a scale is made. The GVF baseline is that of Zhu et al., whose
+    # encoder is one layer.
     "paper": {"*": {}, "gvf": {"embedding_layer": False}, "vusfa": {"eval_latent": "sample"}},
     # The released code, quirks included.
     "reference": {
@@ -96,36 +83,28 @@ class AgentConfig:
 
     Attributes:
         model: a name of :data:`MODELS`.
-        architecture: ``"controlled"``, ``"paper"`` or ``"reference"``, see :data:`ARCHITECTURES`.
-        history: frames H that the encoder reads. 1 with ``memory="lstm"`` unless given.
+        architecture: a name of :data:`ARCHITECTURES`.
+        history: frames H that the encoder reads; 1 with ``memory="lstm"`` unless given.
         embedding_size: E, size of phi, psi and omega.
         hidden_size: outputs of every other layer.
         observation: what the agent reads: ``"index"`` (``state_id``, ``goal_id``), or ``"features"`` or
             ``"pixels"`` (``observation``, ``goal_observation``).
-        encoder: ``"mlp"`` on precomputed features, or ``"conv"``: three convolutions on pictures. Fixed by
-            ``observation`` unless that is ``"index"``.
+        encoder: ``"mlp"`` on precomputed features, or ``"conv"``: three convolutions on pictures.
         picture_size: height and width that the convolutions see, pixels.
         normalize_features: bring each feature to mean 0, deviation 1 over the scenes' states.
-        normalize_embedding: bring phi to mean 0, deviation 1 over its dimensions.
-        shared_encoder: state and goal go through the same weights (siamese).
+        normalize_embedding, shared_encoder, state_layer: see :class:`~vusfa.modules.SiameseEncoder`.
         embedding_layer: a linear layer behind the encoder's first; without it E must equal ``hidden_size``.
-        state_layer: one more dense layer in the state's branch alone.
         memory: ``"lstm"``: a recurrent layer behind the fusion of state and goal.
-        shared_heads: the scene layer, psi, the value and the policy have one set of weights for all scenes
-            and do not read which scene it is; :func:`~vusfa.modules.transplant` takes it to others.
-        pretrained: ``"autoencoder"``: the encoder's weights are constants, made by
-            :func:`~vusfa.modules.pretrain_autoencoder`.
-        successor_norm: ``"layer"`` brings psi to mean 0, deviation 1 over its dimensions on its way into the
-            policy; ``None`` leaves it.
-        successor_scale: factor on the psi layer's output, about 1 / (1 - gamma).
-        reward_scale: factor on the omega layer's output.
-        rectify_logits: a ReLU on the logits.
-        scale: how the bottleneck makes a scale: ``"softplus"`` or ``"raw"``.
-        initial_scale: what the scale starts near; ``None``: as the layer is drawn.
+        shared_heads: all scenes share the weights behind the fusion, and which scene it is is not read;
+            :func:`~vusfa.modules.transplant` takes such an agent to other scenes.
+        pretrained: ``"autoencoder"``: constant encoder of :func:`~vusfa.modules.pretrain_autoencoder`.
+        successor_norm, rectify_logits: see :class:`~vusfa.modules.SuccessorPolicyHead`.
+        successor_scale, reward_scale: factors on the outputs of the layers of psi and omega.
+        scale, initial_scale: see :class:`~vusfa.modules.GaussianBottleneck`.
         eval_latent: what omega reads in evaluation mode: the ``"mean"`` of z_g or a ``"sample"``.
-        deduplicate: encode each distinct state and goal of a batch once; ``False`` encodes row by row, to the
-            same numbers up to rounding, with shapes that depend on no value. While compiling, exporting and
-            under ``torch.vmap`` that is so in any case.
+        deduplicate: encode each distinct state and goal of a batch once. ``False`` encodes row by row, to the
+            same numbers up to rounding, as is done in any case while compiling, exporting and under
+            ``torch.vmap``: no shape then depends on a value.
     """
 
     model: str
@@ -183,8 +162,8 @@ def resolve_config(model: str, architecture: str = "controlled", **overrides: An
     """The configuration of a model in an architecture, with fields overridden.
 
     Raises:
-        ConfigError: an unknown model, architecture, field or value, naming it and what comes near; fields
-            that contradict each other; a field that the paper's architectures do not have.
+        ConfigError: an unknown model, architecture, field or value; fields that contradict each other; a
+            field that the paper's architectures do not have.
 
     >>> config = resolve_config("vusfa", "reference")
     >>> config.history, config.scale, config.state_layer

@@ -10,13 +10,11 @@ __all__ = ["action_probs", "draw", "draw_actions"]
 
 
 def draw_actions(logits: Tensor, interaction: InteractionType | None = None) -> Tensor:
-    """Actions (R,) int64 of logits (R, A): the likeliest, or a draw from their softmax.
-
-    Draws are those of ``torch.distributions.Categorical``, number for number, from torch's global generator.
+    """Actions (R,) int64 of logits (R, A).
 
     Args:
         logits: of the actions.
-        interaction: MODE or DETERMINISTIC for the likeliest; RANDOM or None for a draw.
+        interaction: MODE or DETERMINISTIC for the likeliest; RANDOM or None for a draw from the softmax.
 
     Raises:
         NotImplementedError: for a mean or a median, which actions do not have.
@@ -32,8 +30,7 @@ def draw_actions(logits: Tensor, interaction: InteractionType | None = None) -> 
 
 
 def action_probs(logits: Tensor) -> Tensor:
-    """Probabilities (\\*B, A) of the actions from logits (\\*B, A), rounded as
-    ``torch.distributions.Categorical`` rounds them.
+    """Probabilities (\\*B, A) of logits (\\*B, A), rounded as ``torch.distributions.Categorical`` does.
 
     >>> action_probs(torch.tensor([0.0, 0.0]))
     tensor([0.5000, 0.5000])
@@ -42,11 +39,9 @@ def action_probs(logits: Tensor) -> Tensor:
 
 
 def draw(probs: Tensor) -> Tensor:
-    """Actions (\\*B,) int64 drawn from probabilities (\\*B, A).
+    """Actions (\\*B,) int64 drawn from probabilities (\\*B, A), number for number as ``torch.multinomial``.
 
-    The race that ``torch.multinomial`` runs: exponential clocks, of which the first to ring wins; the same
-    numbers from torch's global generator, and the same winner. Its checks at each call (all probabilities
-    finite and none negative) are left out.
+    The same race: exponential clocks, of which the first to ring wins.
 
     >>> draw(torch.tensor([[0.0, 1.0], [1.0, 0.0]]))
     tensor([1, 0])

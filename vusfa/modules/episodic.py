@@ -1,9 +1,6 @@
-"""Memory of one episode: what was already tried where.
+"""Memory of one episode: which actions were taken in which picture.
 
-In a room that it has never seen an agent does not know where its actions lead, and one of few frames does not
-even know that it has been here before. This remembers, for the length of an episode, which actions were taken
-in which picture, and makes them less likely there. It is counting, not learning: results with it belong
-beside the same memory around a policy that knows nothing.
+It counts and does not learn: compare results with those of the same memory around a random policy.
 """
 
 from __future__ import annotations
@@ -27,15 +24,15 @@ class TriedActions(TensorDictModuleBase):
     .. math::
         \pi(a | s) \propto \exp(l(s, g)_a / T - \beta \, n(s, a))
 
-    with n how often it took a where it saw what it sees now (an id stands for the picture). It reads
-    ``tried`` (\*B, N, A), ``is_init`` and what the agent reads, and writes ``action`` and ``("next",
-    "tried")``, as :func:`vusfa.evaluation.evaluate` carries a policy's memory from step to step.
+    with n(s, a) how often it took a in state s in this episode. It reads ``tried`` (\*B, N, A), ``is_init``
+    and what the agent reads, and writes ``action`` and ``("next", "tried")``, which
+    :func:`vusfa.evaluation.evaluate` carries from step to step.
 
     Args:
-        agent: one without a memory of its own that reads ids; None for a policy that knows nothing.
+        agent: one without a memory that reads ids; None for a random policy.
         num_states: N, of the world.
         num_actions: A.
-        weight: beta, off the logits for each time.
+        weight: beta.
         temperature: T.
 
     >>> from tensordict import TensorDict

@@ -1,17 +1,16 @@
 """Inference-only policies: the actor's actions, without the tensors that only a loss reads.
 
-An actor made of TensorDictModules writes everything that a loss may read. Collecting and evaluating read
-actions alone, at every step, of few rows; then moving tensors about costs as much as the matrix products do.
+With few rows per step, moving what a loss may read about costs as much as the matrix products do.
 :class:`InferencePolicy` runs the actor's own layers on plain tensors. While weights stand still
 (:meth:`InferencePolicy.cached`), whatever depends on single frames is computed once, and an agent that sees
-one frame by its id becomes a table (:class:`TabularPolicy`). This is the one place where something is kept
-from call to call.
+one frame by its id becomes a table (:class:`TabularPolicy`). Nothing else is kept from call to call.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import torch
@@ -19,13 +18,14 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from tensordict.nn.probabilistic import InteractionType, interaction_type
 from torch import Tensor, nn
+from torchrl.modules import LSTMModule
 
 from vusfa.deprecated import moved_names
 from vusfa.errors import ConfigError
 from vusfa.modules.draws import action_probs, draw, draw_actions
 from vusfa.modules.precision import autocast_copy
 from vusfa.modules.rows import RowScenes, SceneBlocks, SortedByScene
-from vusfa.modules.trunk import CachedTrunk, SiameseTrunk
+from vusfa.modules.trunk import CachedTrunk, SiameseTrunk, remember
 from vusfa.modules.unique import shapes_may_vary
 from vusfa.scenes import SceneSet
 
@@ -39,7 +39,7 @@ PAIRS_PER_ROW = 3
 
 
 class _Layers(NamedTuple):
-    """The actor's layers as they are run: ``trunk`` on states and goals, ``heads`` on what it returns."""
+    """``trunk`` runs on states and goals, ``heads`` on what it returns."""
 
     trunk: Callable[[Tensor, Tensor], Any]
     heads: list[nn.Module]
@@ -48,15 +48,12 @@ class _Layers(NamedTuple):
 class InferencePolicy(TensorDictModuleBase):
     """Inference-only policy: the same actions as the actor's, without intermediate tensors.
 
-    It writes ``action`` and nothing else. Actions are drawn by default;
+    It writes ``action``, the next state of an LSTM, and nothing else. Actions are drawn by default;
     ``torchrl.envs.utils.set_exploration_type`` asks for the likeliest. Weights are the agent's own, so an
     update reaches it at once.
 
     Args:
-        agent: any without a memory, whose state would have to be written, too.
-
-    Raises:
-        ValueError: for an agent with a memory; its actor is ``agent.get_policy_operator()``.
+        agent: any.
 
     >>> from tensordict import TensorDict
     >>> from vusfa.modules import make_agent
@@ -72,12 +69,13 @@ class InferencePolicy(TensorDictModuleBase):
 
     def __init__(self, agent: Agent) -> None:
         super().__init__()
-        if agent.memory is not None:
-            raise ValueError("the agent has a memory, which must be kept; take agent.get_policy_operator()")
         self.agent = agent
         trunk, *heads = agent.actor_steps()
-        self.in_keys = [*trunk.in_keys, "scene_id"]
-        self.out_keys = ["action"]
+        memory = None if agent.memory is None else heads[0]
+        self._memory_keys = [] if memory is None else memory.in_keys[1:]
+        self._written_keys = [] if memory is None else memory.out_keys[1:]
+        self.in_keys = [*trunk.in_keys, "scene_id", *self._memory_keys]
+        self.out_keys = ["action", *self._written_keys]
         read = {key for step in heads for key in step.in_keys}
         self._whole = not isinstance(trunk.module, SiameseTrunk) or bool(read & set(trunk.out_keys[:-1]))
         self._trunk_keys = trunk.out_keys if self._whole else trunk.out_keys[-1:]
@@ -110,11 +108,12 @@ class InferencePolicy(TensorDictModuleBase):
             self._layers, self._table = before
 
     def _cached_layers(self, goals: Tensor | None, rows: int | None) -> _Layers:
-        trunk, *heads = (step.module for step in self.agent.actor_steps())
+        trunk, *heads = self._modules_run()
+        memory = [] if self.agent.memory is None else [heads.pop(0)]
         if self._whole or not trunk.encoder.by_id or self._computes_frames(rows):
             trunk, *heads = autocast_copy([trunk, *heads])
-            return _Layers(trunk if self._whole else trunk.fused, heads)
-        return _Layers(CachedTrunk(trunk, goals, rows).fused, autocast_copy(heads))
+            return _Layers(trunk if self._whole else trunk.fused, [*memory, *heads])
+        return _Layers(CachedTrunk(trunk, goals, rows).fused, [*memory, *autocast_copy(heads)])
 
     def _computes_frames(self, rows: int | None) -> bool:
         """Whether frames are learned, and so few are asked for that not all should be computed."""
@@ -123,7 +122,7 @@ class InferencePolicy(TensorDictModuleBase):
         return learned and rows is not None and 2 * rows < frames.num_states
 
     def logits(self, state: Tensor, goal: Tensor, scene_id: RowScenes) -> Tensor:
-        """Logits (R, A) float32 of rows.
+        """Logits (R, A) of rows, for an agent without a memory.
 
         Args:
             state: (R, H) int64 ids, oldest first, or observations (R, H, ...), as the agent reads them.
@@ -131,26 +130,36 @@ class InferencePolicy(TensorDictModuleBase):
             scene_id: (R,) int64; or, of rows sorted by scene, with the counts; or blocks that the rows, in
                 any order, are to be laid out in.
         """
-        trunk, heads = self._layers or self._own_layers()
-        written = trunk(state, goal)
-        values: dict[Any, Any] = dict(zip(self._trunk_keys, _tuple(written), strict=True))
         blocks = scene_id if isinstance(scene_id, SceneBlocks) else None
+        logits = self._run(state, goal, {"scene_id": scene_id}, blocks)["logits"]
+        return logits if blocks is None else blocks.pick_up(logits)
+
+    def _run(
+        self, state: Tensor, goal: Tensor, others: dict[Any, Any], blocks: SceneBlocks | None = None
+    ) -> dict[Any, Any]:
+        """All that the layers write, from observations of rows and the ``others`` that they read."""
+        trunk, heads = self._layers or self._own_layers()
+        values: dict[Any, Any] = dict(zip(self._trunk_keys, _tuple(trunk(state, goal)), strict=True))
         if blocks is not None:
             values = {key: blocks.lay_out(value) for key, value in values.items()}
-        values["scene_id"] = scene_id
+        values |= others
         for head, (in_keys, out_keys) in zip(heads, self._keys, strict=True):
             values.update(zip(out_keys, _tuple(head(*(values[key] for key in in_keys))), strict=True))
-        return values["logits"] if blocks is None else blocks.pick_up(values["logits"])
+        return values
+
+    def _modules_run(self) -> list[Any]:
+        memory = partial(remember, self.agent.memory)
+        return [memory if isinstance(s, LSTMModule) else s.module for s in self.agent.actor_steps()]
 
     def _own_layers(self) -> _Layers:
-        trunk, *heads = (step.module for step in self.agent.actor_steps())
+        trunk, *heads = self._modules_run()
         return _Layers(trunk if self._whole else trunk.fused, heads)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Adds ``action``, (\\*B,) int64."""
+        """Adds ``action``, (\\*B,) int64, and the next state of a memory."""
         if self._table:
             return self._table[0](tensordict)
-        state, goal, scene = (tensordict.get(key, None) for key in self.in_keys)
+        state, goal, scene, *memory = (tensordict.get(key, None) for key in self.in_keys)
         if state is None or goal is None or scene is None:
             raise ConfigError(
                 f"the policy reads {self.in_keys}, and some of these are missing; TargetNavEnv sends ids, and"
@@ -158,8 +167,17 @@ class InferencePolicy(TensorDictModuleBase):
             )
         batch = scene.dim()
         rows = state.reshape(-1, *state.shape[batch:]), goal.reshape(-1, *goal.shape[batch:])
-        actions = draw_actions(self._by_scene(*rows, scene.reshape(-1)), interaction_type())
-        return tensordict.set("action", actions.view(scene.shape))
+        if not memory:
+            actions = draw_actions(self._by_scene(*rows, scene.reshape(-1)), interaction_type())
+            return tensordict.set("action", actions.view(scene.shape))
+        if memory[-1] is None:
+            raise ConfigError("the policy reads 'is_init'; give the environment agent.make_env_transforms()")
+        others = dict(zip(self._memory_keys, memory, strict=True))
+        others = {key: None if x is None else x.reshape(-1, *x.shape[batch:]) for key, x in others.items()}
+        values = self._run(*rows, {"scene_id": scene.reshape(-1), **others})
+        for key in self._written_keys:
+            tensordict.set(key, values[key].view(*scene.shape, *values[key].shape[1:]))
+        return tensordict.set("action", draw_actions(values["logits"], interaction_type()).view(scene.shape))
 
     def _by_scene(self, state: Tensor, goal: Tensor, scene: Tensor) -> Tensor:
         """Logits of rows in any order, computed scene by scene."""
@@ -175,13 +193,10 @@ class InferencePolicy(TensorDictModuleBase):
 
 
 class TabularPolicy(TensorDictModuleBase):
-    """The policy of an agent that sees one frame by its id, as a table: logits of every state to every goal
-    in its scene.
+    """Table of an agent that sees one frame by its id: logits of every state and goal of a scene.
 
-    Such an agent is a function of two small numbers. Where many steps are walked with the same weights, one
-    large product for all pairs and a look-up per step cost less than asking it at every step. Pairs are
-    numbered scene by scene, goal by goal, state by state. Actions are those of
-    :func:`~vusfa.modules.draws.draw_actions` from the pair's logits.
+    Where many steps are walked with the same weights, one large product for all pairs and a look-up per step
+    cost less than asking the agent. Pairs are numbered scene by scene, goal by goal, state by state.
 
     Args:
         agent: as it is now; later updates do not reach the table.
@@ -265,7 +280,7 @@ class TabularPolicy(TensorDictModuleBase):
 
 
 def _table_pays(scenes: SceneSet, goals: Tensor | None, rows: int | None) -> bool:
-    """A pair in a product of thousands costs a fraction of what it costs in a step's product of 64 rows."""
+    """Whether a table costs less than its look-ups save: in large products a pair costs a fraction."""
     if rows is None:
         return True
     scene = scenes.scene_id if goals is None else scenes.scene_id[goals.to(scenes.device).unique()]

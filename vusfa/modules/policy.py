@@ -1,9 +1,4 @@
-"""Policy heads: hidden state to logits.
-
-Successor feature dependent policy (SFDP): the head of SFDP and VUSFA reads psi(s, g) beside the hidden
-state, and reads it as a constant. The policy's gradient must not bend psi away from what it predicts, so
-psi is detached, here and nowhere else.
-"""
+"""Policy heads: hidden state to logits."""
 
 from __future__ import annotations
 
@@ -38,16 +33,18 @@ class PolicyHead(nn.Module):
 
 
 class SuccessorPolicyHead(nn.Module):
-    """[hidden, psi] through a dense layer with ReLU, then a linear one, both a scene's own (SFDP and VUSFA).
+    """Successor feature dependent policy (SFDP): [hidden, psi] through a dense layer, ReLU and a linear one.
+
+    Both layers are a scene's own. psi is read as a constant, detached here and nowhere else: the policy's
+    gradient must not bend psi away from what it predicts.
 
     Args:
         num_scenes: scenes with weights of their own.
         hidden_size: size of the hidden state and of the dense layer.
         embedding_size: E, size of psi.
         num_actions: A.
-        successor_norm: psi grows with the horizon (the sum of about 1 / (1 - gamma) embeddings) and drifts
-            as they do. ``"layer"`` brings it to mean 0 and deviation 1 over its dimensions, ``None`` leaves
-            it.
+        successor_norm: ``"layer"`` brings psi, a sum of about 1 / (1 - gamma) embeddings, to mean 0 and
+            deviation 1 over its dimensions; ``None`` leaves it.
         rectify_logits: a ReLU on the logits, as in the released VUSFA.
 
     >>> head = SuccessorPolicyHead(1, 32, 16, 4, successor_norm="layer")

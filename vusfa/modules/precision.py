@@ -1,8 +1,7 @@
-"""Numeric precision: what autocast converts, and row counts that bfloat16 kernels have met before.
+"""Numeric precision: conversions of autocast, and padding to a few numbers of rows.
 
-A processor compiles a bfloat16 kernel per matrix shape, which takes longer than running it and stays in
-memory. Where the number of rows changes from call to call, rows of zeros bring it to one of a few bucket
-sizes (:func:`bucket_size`).
+A processor compiles a bfloat16 kernel per matrix shape, which takes longer than running it. Where the number
+of rows changes from call to call, rows of zeros bring it to one of a few bucket sizes.
 """
 
 from __future__ import annotations
@@ -19,7 +18,7 @@ __all__ = ["autocast_copy", "bucket_size", "for_autocast", "full_precision", "is
 
 
 def for_autocast(tensor: Tensor) -> Tensor:
-    """A tensor as autocast would convert it for a matrix product, where autocast is on; else unchanged.
+    """A tensor as autocast converts it for a matrix product; unchanged where autocast is off.
 
     >>> with torch.autocast("cpu", torch.bfloat16):
     ...     for_autocast(torch.zeros(2)).dtype
@@ -41,12 +40,10 @@ def full_precision(tensor: Tensor, weight: Tensor) -> Tensor:
 
 
 def autocast_copy(modules: Sequence[Any]) -> list[Any]:
-    """A copy of modules for inference, its weights converted once as autocast would at each call.
+    """A copy of modules, with weights converted once as autocast does at each call.
 
-    Buffers, and weights that need no conversion, are shared with the originals.
-
-    Args:
-        modules: they may share submodules.
+    The modules may share submodules. Buffers, and weights that need no conversion, are
+    shared with the originals.
 
     >>> layer = nn.Linear(2, 3)
     >>> with torch.autocast("cpu", torch.bfloat16):
@@ -62,7 +59,7 @@ def autocast_copy(modules: Sequence[Any]) -> list[Any]:
 
 
 def bucket_size(number: int) -> int:
-    """The next larger of a few numbers: 16, 32, ... 256, 288, ..., 512, 576, ..., eight per octave.
+    """The next larger bucket size: 16, 32, ... 256, 288, ..., 512, 576, ..., eight per octave.
 
     >>> [bucket_size(number) for number in (1, 17, 256, 257, 1025)]
     [16, 32, 256, 288, 1152]
@@ -72,22 +69,14 @@ def bucket_size(number: int) -> int:
 
 
 def is_bucketed(rows: Tensor) -> bool:
-    """Whether the number of rows (R, ...) should be a bucket size: in bfloat16 on a processor."""
+    """Whether rows (R, ...) should be padded to a bucket size: in bfloat16 on a processor."""
     return not rows.is_cuda and for_autocast(rows).dtype == torch.bfloat16
 
 
 def padded_linear(rows: Tensor, weight: Tensor, bias: Tensor | None = None) -> Tensor:
-    """``torch.nn.functional.linear`` for a number of rows that changes from call to call.
+    """``torch.nn.functional.linear`` on rows (R, in), padded where :func:`is_bucketed`.
 
-    Rows of zeros are added where :func:`is_bucketed`; they add nothing to outputs or gradients.
-
-    Args:
-        rows: (R, in); with more dimensions, never padded.
-        weight: (out, in).
-        bias: (out,), or None.
-
-    Returns:
-        (R, out).
+    Rows of zeros add nothing to outputs or gradients. With more dimensions, rows are never padded.
 
     >>> padded_linear(torch.ones(3, 2), torch.ones(1, 2), torch.ones(1)).flatten()
     tensor([3., 3., 3.])

@@ -1,12 +1,10 @@
 """Siamese encoder phi: the same weights for the state that the agent is in and the goal that it looks for.
 
-A frame's features go through a layer over the history (:class:`~vusfa.modules.linear.HistoryLinear`) and a
-linear layer; the result is phi, or, with a bottleneck, the mean and scale of a Gaussian whose mean is phi;
-optionally phi is normalized over its dimensions. Observations by id are encoded once per DISTINCT state and
-goal of a batch (:mod:`vusfa.modules.unique`), in two steps: :meth:`SiameseEncoder.first_layer` gives the
-first layer's sums of those rows, :meth:`~SiameseEncoder.encode_state` and
-:meth:`~SiameseEncoder.encode_goal` what follows. The first layer, nine tenths of the work, is a sum of one
-product per frame: distinct frames are multiplied once and histories are sums of the products.
+Features go through a layer over the history (:class:`~vusfa.modules.HistoryLinear`) and a linear layer. The
+result is phi or, with a bottleneck, mean and scale of a Gaussian whose mean is phi. Ids are encoded once per
+distinct state and goal of a batch (:mod:`vusfa.modules.unique`): :meth:`SiameseEncoder.first_layer` computes
+nine tenths of the work, a product per distinct frame, whose sums are histories; ``encode_*`` and ``embed_*``
+what follows.
 """
 
 from __future__ import annotations
@@ -28,7 +26,7 @@ __all__ = ["Branch", "Encoding", "SiameseEncoder"]
 
 
 class Encoding(NamedTuple):
-    """What the encoder says of D states, or of D goals.
+    """Encodings of D states, or of D goals.
 
     Attributes:
         embedding: phi, (D, E).
@@ -42,20 +40,13 @@ class Encoding(NamedTuple):
     kl: Tensor | None = None
 
     def gather(self, index: Tensor | None, batch: torch.Size) -> Encoding:
-        """The encodings of rows: each (\\*batch, ...); one look-up per tensor, even if it stands twice."""
+        """The encodings of rows, (\\*batch, ...) each; one look-up per tensor, even if it stands twice."""
         parts = {id(part): gather(part, index).view(*batch, -1) for part in self if part is not None}
         return Encoding(parts[id(self.embedding)], *(parts.get(id(part)) for part in self[1:]))
 
 
 class Branch(nn.Module):
-    """Frame features to code: a layer over the history, then dense layers.
-
-    Args:
-        history: frames H.
-        in_features: F, features per frame.
-        hidden_size: outputs of the first layer, which ends in a ReLU.
-        out_features: outputs of the linear last layer; ``None`` for no second layer.
-    """
+    """Features of H frames to a code: a layer over the history with ReLU, then a linear one (None: none)."""
 
     def __init__(self, history: int, in_features: int, hidden_size: int, out_features: int | None) -> None:
         super().__init__()
@@ -63,13 +54,8 @@ class Branch(nn.Module):
         self.last = None if out_features is None else nn.Linear(hidden_size, out_features)
 
     def finish(self, first: Tensor, extra: nn.Module | None = None, *, half: bool = False) -> Tensor:
-        """Codes from the first layer's sums (\\*B, hidden_size): ReLU, ``extra`` with ReLU, last layer.
-
-        Args:
-            first: the sums.
-            extra: one more layer.
-            half: compute only the leading half of the last layer's outputs.
-        """
+        """Codes from the first layer's sums (\\*B, hidden_size): ReLU, ``extra`` with ReLU, last layer or the
+        leading ``half`` of its outputs."""
         code = functional.relu(first)
         if extra is not None:
             code = functional.relu(extra(code))
@@ -88,17 +74,16 @@ class SiameseEncoder(nn.Module):
         frames: where the features of a frame come from.
         history: H.
         hidden_size: size of the first layer.
-        out_features: E, size of phi; ``None`` leaves the linear second layer out, phi is the first layer's
-            output.
-        shared: ``False`` gives the goal a branch of its own (the released USFA; not siamese any more).
+        out_features: E, size of phi; ``None`` leaves the linear second layer out.
+        shared: ``False`` gives the goal weights of its own (the released USFA).
         state_layer: one more dense layer for the state alone, before the last (the released VUSFA).
         by_id: the module reads ids of states; ``False``: observations.
         bottleneck: makes a Gaussian of each code; phi is its mean.
         deduplicate: encode each distinct state and goal of a batch of ids once. ``False`` encodes row by row,
             as is done in any case while compiling, exporting or under ``torch.vmap``.
-        normalize: bring phi to mean 0 and deviation 1 over its E dimensions. Without it, phi, psi and V = psi
-            . omega can drive each other up without bound; with a bottleneck, pi and psi go on reading
-            full-sized means while the KL term presses the means that omega's sample is made of towards 0.
+        normalize: bring phi to mean 0 and deviation 1 over its E dimensions. Without it, phi, psi and V can
+            drive each other up without bound; with a bottleneck, pi and psi go on reading full-sized means
+            while the KL term presses those that omega's sample is made of towards 0.
 
     >>> from vusfa.scenes import SceneSet
     >>> scenes = SceneSet.bundled(["bathroom"])
@@ -150,7 +135,7 @@ class SiameseEncoder(nn.Module):
 
         Returns:
             phi of state and goal; with a bottleneck then mean, scale and KL of the state's Gaussian, and
-            those of the goal's. All (\\*B, E) float32, the KL (\\*B, 1).
+            those of the goal's. All (\\*B, E), the KL (\\*B, 1).
 
         Raises:
             ConfigError: fewer than H frames.
@@ -238,9 +223,9 @@ class SiameseEncoder(nn.Module):
         return state_rows, Rows(goal_sums, goal_index)
 
     def _distinct_frames(self, states: Tensor, goals: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Features (D, F) of the batch's distinct frames, and the rows of states (R, H) and goals (R,).
+        """Features (D, F) of the distinct frames, and the rows of states (R, H) and goals (R,) among them.
 
-        All states of the world when the batch has at least as many rows: then the id is the row.
+        With as many rows as the world has states: of all states, so that the id is the row.
         """
         if len(goals) >= self.frames.num_states:
             return self.frames.lookup(None), states, goals

@@ -1,7 +1,6 @@
-"""Universal successor features: psi, omega, and the value they make.
+"""Universal successor features: V(s, g) = psi(s, g) . omega(g) (arXiv 1908.06376, section 3).
 
-psi(s, g) is the discounted sum of the embeddings to come, omega(g) what each dimension of them is worth on
-the way to g, and V(s, g) = psi(s, g) . omega(g) (arXiv 1908.06376, section 3).
+psi(s, g) is the discounted sum of the embeddings to come, omega(g) what each of their dimensions is worth.
 """
 
 from __future__ import annotations
@@ -23,8 +22,8 @@ class SuccessorHead(nn.Module):
         num_scenes: scenes with weights of their own.
         hidden_size: size of the hidden state.
         embedding_size: E, size of psi.
-        scale: factor on the layer's output. psi sums embeddings over about 1 / (1 - gamma) steps; with that
-            as the factor, the layer's own outputs are of the embeddings' size.
+        scale: factor on the layer's output. With 1 / (1 - gamma), the number of embeddings that psi is a sum
+            of, the layer's own outputs are of the embeddings' size.
 
     >>> import torch
     >>> SuccessorHead(2, 32, 16)(torch.randn(5, 32), torch.tensor([0, 1, 1, 0, 1])).shape
@@ -44,13 +43,13 @@ class SuccessorHead(nn.Module):
 
 
 class RewardHead(nn.Module):
-    """omega: what the goal makes each dimension of psi worth; a dense layer with ReLU, then a linear one.
+    """omega: reward weights of a goal; a dense layer with ReLU, then a linear one.
 
     Args:
         embedding_size: E, size of the goal's embedding and of omega.
         hidden_size: outputs of the first layer.
-        scale: factor on the last layer's output. V is a sum of E products, so a step of the optimiser moves
-            it by E times what it moves a weight; a small factor keeps that step small.
+        scale: factor on the last layer's output. V is a sum of E products, so a step of the optimizer moves
+            it E times as far as a weight; a small factor keeps that step small.
 
     >>> import torch
     >>> RewardHead(16, 32)(torch.randn(5, 16)).shape

@@ -13,20 +13,16 @@ __all__ = ["transplant"]
 
 
 def transplant(agent: Agent, scenes: Any) -> Agent:
-    """A copy of an agent with ``shared_heads`` that lives in other scenes, with the same weights.
+    """A copy of an agent with ``shared_heads`` for other scenes, with the same weights, device and mode.
 
-    It looks at the new scenes as at those it was trained in: features are normalized by the mean and
-    deviation of the TRAINING scenes, which are among its weights. For equal features it gives equal numbers.
+    Features are normalized by the mean and deviation of the training scenes, which are among the weights.
 
     Args:
         agent: built with ``shared_heads=True``.
         scenes: a ``SceneSet`` with features of the same size and as many actions.
 
-    Returns:
-        an agent on the same device, training or evaluating as the given one does. No tensor is shared.
-
     Raises:
-        ConfigError: the agent has heads of its own for each scene, or the scenes do not fit it.
+        ConfigError: the agent has heads for each scene, or the scenes do not fit it.
 
     >>> from vusfa.scenes import SceneSet
     >>> home, other = SceneSet.bundled(["bathroom"]), SceneSet.bundled(["kitchen", "bedroom"])

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
@@ -12,7 +14,7 @@ from vusfa.modules.rows import RowScenes
 from vusfa.modules.siamese import SiameseEncoder, joined
 from vusfa.modules.unique import gather
 
-__all__ = ["CachedTrunk", "Fusion", "SceneLayer", "SiameseTrunk"]
+__all__ = ["CachedTrunk", "Fusion", "SceneLayer", "SiameseTrunk", "remember"]
 
 
 class Fusion(nn.Module):
@@ -197,3 +199,15 @@ class SceneLayer(nn.Module):
     def forward(self, fused: Tensor, scene_id: RowScenes) -> Tensor:
         """(\\*B, in) with scene indices (\\*B,) to (\\*B, hidden_size)."""
         return functional.relu(self.linear(fused, scene_id))
+
+
+def remember(
+    lstm: Any, rows: Tensor, hidden: Tensor | None, cell: Tensor | None, is_init: Tensor
+) -> tuple[Tensor, ...]:
+    """One step of an LSTM on rows (R, F) with its state (R, layers, size), 0 at first or for None."""
+    if hidden is None or cell is None:
+        out, state = lstm(rows.unsqueeze(1))
+    else:
+        going = ~is_init.view(-1, 1, 1)
+        out, state = lstm(rows.unsqueeze(1), tuple((x * going).transpose(0, 1) for x in (hidden, cell)))
+    return out.squeeze(1), *(x.transpose(0, 1) for x in state)

@@ -1,9 +1,8 @@
 """Compute each distinct row once: unique rows -> run -> gather.
 
-A batch of thousands of steps visits a few hundred states on the way to a few goals. The encoder therefore
-runs on the DISTINCT states and goals of a batch, and the loss on its distinct pairs of both
-(:class:`vusfa.objectives.USFLoss`): :func:`unique_rows` finds them, the network runs on them, and
-:func:`gather` looks up each row's result. Gradients of equal rows add up before they go through the network.
+A batch of thousands of steps visits a few hundred states on the way to a few goals. The encoder runs on the
+distinct states and goals of a batch, and :class:`vusfa.objectives.USFLoss` on its distinct pairs. Gradients
+of equal rows add up before they go through the network.
 
 >>> unique = unique_rows(torch.tensor([4, 7, 4, 4]), torch.tensor([1, 1, 1, 0]))
 >>> [column.tolist() for column in unique.columns], unique.inverse.tolist()
@@ -56,7 +55,7 @@ class Unique(NamedTuple):
     inverse: Tensor
 
     def padded(self) -> Unique:
-        """The same with rows of zeros at the end, which no row belongs to, so that D is a bucket size.
+        """The same, D padded to a bucket size by rows of zeros that nothing refers to.
 
         >>> len(unique_rows(torch.tensor([5, 5, 3])).padded().columns[0])
         16
@@ -66,12 +65,7 @@ class Unique(NamedTuple):
 
 
 class Rows(NamedTuple):
-    """What was computed for some rows, to be gathered for all.
-
-    Attributes:
-        values: (D, F) per distinct row; or, without an inverse, (R, F) for the rows themselves.
-        inverse: (R,) int64, or None.
-    """
+    """Values (D, F) of distinct rows and each row's index (R,) into them; or (R, F) of the rows, and None."""
 
     values: Tensor
     inverse: Tensor | None = None

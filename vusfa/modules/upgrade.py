@@ -37,14 +37,10 @@ def upgrade_agent_config(config: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def upgrade_agent_state(state: Mapping[str, Any], config: Mapping[str, Any]) -> dict[str, Any]:
-    """An agent's ``state_dict`` under this version's names, from version 0.1's or this one's.
+    """An agent's ``state_dict`` under this version's names, from that of version 0.1 or of this one.
 
-    Version 0.1 wrapped the encoder in one module for the bottleneck and one for the normalization. The
-    order of the weights is the same.
-
-    Args:
-        state: the ``state_dict``.
-        config: the agent's, of either version; nothing hangs on it yet.
+    Version 0.1 wrapped the encoder in modules for the bottleneck and the normalization. The order of the
+    weights is the same. The agent's ``config`` makes no difference yet.
 
     >>> list(upgrade_agent_state({"encoder.encoder.encoder.branch.first.bias": 0}, {}))
     ['encoder.branch.first.bias']

@@ -92,8 +92,8 @@ class Trainer:
         self.settings, self.overrides = settings, overrides
         self.observation, self.note = observation, note
         self.actor = agent.get_policy_operator(out_keys=["action"])
-        self.acting = None if agent.memory is not None else InferencePolicy(agent)
-        self._make_collector = partial(make_collector, self.actor if self.acting is None else self.acting)
+        self.acting = InferencePolicy(agent)
+        self._make_collector = partial(make_collector, self.acting)
         self.frames, self.updates, self.seconds = 0, 0, 0.0
         self.run_id = secrets.token_hex(4)
         self.episodes, self.terms = EpisodeMeter(scenes, goals), MeanMeter()
@@ -124,7 +124,7 @@ class Trainer:
         """
         collector = self._collector
         with self._precision(), ExitStack() as stack:
-            if self.acting is not None and isinstance(collector, Collector):
+            if isinstance(collector, Collector):
                 frames = collector.requested_frames_per_batch
                 stack.enter_context(self.acting.cached(self.goals, self.scenes, frames))
             return next(batches)
