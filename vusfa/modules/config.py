@@ -39,7 +39,7 @@ MODELS: dict[str, Model] = {
 
 #: What an architecture sets, for all models (``"*"``) and then for one; else AgentConfig's default holds.
 ARCHITECTURES: dict[str, dict[str, dict[str, Any]]] = {
-    # The four models differ only in the ideas of MODELS. The five settings below are none of the paper's: with
+    # The four models differ only in the ideas of MODELS. The five settings below are not the paper's: with
     # them all four models learn (docs/training.md).
     "controlled": {
         "*": {
