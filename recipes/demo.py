@@ -22,7 +22,7 @@ def demo(settings: dict[str, Any], overrides: list[str]) -> int:
     trainer, result, exit_code = train(settings, overrides)
     if result is None:
         return exit_code
-    folder, agent, scenes = Path(settings["folder"]), trainer.agent.eval(), trainer.scenes
+    folder, agent, scenes = Path(trainer.settings["folder"]), trainer.agent.eval(), trainer.scenes
     made, within = [], f"success_{settings['evaluation']['max_steps']}"
     if (folder / "metrics.csv").is_file():  # nothing is logged when there was nothing left to train
         rows = [row for row in result.rows if (row["policy"], row["goals"]) == (RANDOM_WALK, "trained")]

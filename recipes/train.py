@@ -7,17 +7,17 @@ recipes/train.py resume=RUN/checkpoint.pt
 
 from __future__ import annotations
 
-import sys
 from typing import Any
 
 from vusfa.cli.launch import launch
 from vusfa.experiments.training import train
+from vusfa.files import say
 
 
 def main(settings: dict[str, Any], overrides: list[str]) -> int:
     """Trains and evaluates, and says where the results are."""
-    exit_code = train(settings, overrides).exit_code
-    print(f"{settings['folder']}/checkpoint.pt", file=sys.stderr)
+    trainer, _, exit_code = train(settings, overrides)
+    say(f"{trainer.settings['folder']}/checkpoint.pt")
     return exit_code
 
 

@@ -13,8 +13,10 @@ __all__ = [
     "CheckpointError",
     "ConfigError",
     "GoalError",
+    "ResultError",
     "SceneError",
     "VusfaError",
+    "WorkerError",
 ]
 
 
@@ -54,3 +56,7 @@ class ConfigError(VusfaError):
 
 class ResultError(VusfaError):
     """Results on disk that are damaged, or that cannot be written so."""
+
+
+class WorkerError(VusfaError):
+    """A process that collects data has died, does not answer, or cannot start."""

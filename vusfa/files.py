@@ -8,13 +8,28 @@ import io
 import json
 import math
 import os
+import re
+import shutil
+import sys
+import tempfile
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from multiprocessing.util import Finalize
 from pathlib import Path
 from typing import Any
 
-from vusfa.errors import ConfigError
+from vusfa.errors import ConfigError, ResultError
 
-__all__ = ["check_folder", "replacing", "write_csv", "write_json", "write_text"]
+__all__ = [
+    "cannot_write",
+    "check_folder",
+    "remove_leftovers",
+    "replacing",
+    "say",
+    "use_own_temporary_folder",
+    "write_csv",
+    "write_json",
+    "write_text",
+]
 
 
 def check_folder(path: str | Path, setting: str) -> Path:
@@ -45,7 +60,10 @@ def replacing(path: str | Path) -> Iterator[Path]:
     end.
 
     Whoever reads ``path`` finds the old content or the new, never a part of it, whenever this process dies.
-    On an exception nothing is left behind.
+    On an exception nothing is left behind; what a killed process left, :func:`remove_leftovers` finds.
+
+    Raises:
+        ResultError: the disk is full, the folder may not be written, or another fault of the system.
 
     >>> import tempfile
     >>> with tempfile.TemporaryDirectory() as folder:
@@ -55,15 +73,83 @@ def replacing(path: str | Path) -> Iterator[Path]:
     'whole'
     """
     path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
     unfinished = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:
+        path.parent.mkdir(parents=True, exist_ok=True)
         yield unfinished
         with open(unfinished, "rb") as file:
             os.fsync(file.fileno())
         os.replace(unfinished, path)
+    except OSError as error:
+        raise cannot_write(path, error) from error
     finally:
-        unfinished.unlink(missing_ok=True)
+        with contextlib.suppress(OSError):
+            unfinished.unlink()
+
+
+def cannot_write(path: str | Path, error: OSError) -> ResultError:
+    """The error for a file that the system does not take.
+
+    >>> str(cannot_write("a.csv", OSError(28, "No space left on device")))
+    'a.csv: cannot be written (No space left on device); what was there before is as it was'
+    """
+    return ResultError(
+        f"{path}: cannot be written ({error.strerror or error}); what was there before is as it was"
+    )
+
+
+def remove_leftovers(folder: str | Path) -> None:
+    """Remove what processes that were killed left in a folder: unfinished files of :func:`replacing`, and
+    folders of :func:`use_own_temporary_folder`.
+
+    >>> import tempfile
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     _ = (Path(folder) / f".a.csv.{2**22}.tmp").write_text("ha")
+    ...     remove_leftovers(folder)
+    ...     os.listdir(folder)
+    []
+    """
+    with contextlib.suppress(OSError):
+        for place in os.scandir(folder):
+            found = re.fullmatch(r"\..+\.(\d+)\.tmp|vusfa-(\d+)-\w+", place.name)
+            if found is None or _is_alive(int(found[1] or found[2])):
+                continue
+            with contextlib.suppress(OSError):
+                if found[1]:
+                    os.unlink(place.path)
+                elif place.is_dir(follow_symlinks=False) and place.stat().st_uid == os.getuid():
+                    shutil.rmtree(place.path, ignore_errors=True)
+
+
+def use_own_temporary_folder() -> None:
+    """Give this process, its children and the libraries in it a temporary folder of their own, removed at
+    exit; one that a killed process left is removed now."""
+    if Path(tempfile.gettempdir()).name.startswith("vusfa-"):
+        return
+    remove_leftovers(tempfile.gettempdir())
+    try:
+        folder = tempfile.mkdtemp(prefix=f"vusfa-{os.getpid()}-")
+    except OSError:  # then in the shared one
+        return
+    # after multiprocessing's own folders in it (priority -100); a forked process does not do it
+    Finalize(None, shutil.rmtree, args=(folder,), kwargs={"ignore_errors": True}, exitpriority=-200)
+    os.environ["TMPDIR"] = tempfile.tempdir = folder
+
+
+def _is_alive(process: int) -> bool:
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    except (OSError, OverflowError):
+        return True  # another user's
+    return True
+
+
+def say(text: str) -> None:
+    """Print a line on standard error; that nobody reads it any more ends nothing."""
+    with contextlib.suppress(OSError, ValueError):
+        print(text, file=sys.stderr, flush=True)
 
 
 def write_csv(

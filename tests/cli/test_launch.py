@@ -10,7 +10,7 @@ import torch
 from omegaconf import OmegaConf
 
 from vusfa.cli.launch import compose, launch
-from vusfa.errors import ConfigError
+from vusfa.errors import ConfigError, ResultError
 from vusfa.training import save_checkpoint
 
 
@@ -116,13 +116,70 @@ def test_every_run_of_a_sweep_has_its_folder(run):
     folders = []
 
     def job(settings, overrides):
-        folders.append(Path(settings["folder"]).name)
+        folders.append(Path(settings["folder"]))
         return len(folders)
 
     sweep = "hydra.sweep.dir=../sweep"
     assert run("--multirun", sweep, "seed=1,2", job=job)[0] == 2
     assert run("--multirun", sweep, "seed=1,2", "folder=mine", job=job)[0] == 4
-    assert folders == ["0", "1", "mine", "mine"]
+    assert [str(folder) for folder in folders[2:]] == ["mine/0", "mine/1"]
+    assert [folder.name for folder in folders[:2]] == ["0", "1"]
+    assert run("--multirun", sweep, "seed=1", "folder=one,two", job=job)[0] == 6
+    assert run("--multirun", sweep, "seed=1,2", "folder=run${seed}", job=job)[0] == 8
+    assert [str(folder) for folder in folders[4:]] == ["one", "two", "run1", "run2"]
+
+
+@pytest.mark.parametrize("code", [129, 130, 143])
+def test_a_signal_ends_a_sweep(run, code: int):
+    """SIGHUP, Ctrl-C, SIGTERM: the job says that it was ended by one, and no other job begins."""
+    jobs = []
+    assert (
+        run("--multirun", "hydra.sweep.dir=../sweep", "seed=1,2,3", job=lambda *_: jobs.append(1) or code)[0]
+        == code
+    )
+    assert len(jobs) == 1
+
+
+def test_a_run_that_fails_does_not_end_a_sweep(run):
+    jobs = []
+
+    def job(settings, overrides):
+        jobs.append(settings["seed"])
+        if settings["seed"] == 1:
+            raise ResultError("a.csv: cannot be written (No space left on device)")
+        return 0
+
+    code, text = run("--multirun", "hydra.sweep.dir=../sweep", "seed=1,2", job=job)
+    assert (code, jobs) == (1, [1, 2])
+    assert text == "error: a.csv: cannot be written (No space left on device)\n"
+
+
+def test_faults_of_the_system_are_one_line(run):
+    def full(settings, overrides):
+        raise OSError(28, "No space left on device", "a.csv")
+
+    code, text = run(job=full)
+    assert (code, text.count("\n")) == (1, 1)
+    assert text.startswith("error: a.csv: No space left on device; ")
+
+
+def test_resume_auto(run, checkpoint, settings_of):
+    path = checkpoint("seed=3")
+    settings = settings_of("resume=auto", f"folder='{path.parent}'", "preset=controlled", "seed=4")
+    assert (settings["resume"], settings["seed"], settings["name"]) == (str(path), 4, "controlled")
+    assert settings_of("resume=auto", "folder=nothing")["resume"] is None
+    assert run("resume=auto")[1].startswith("error: resume=auto looks into the run's folder; give folder=")
+
+
+@pytest.mark.parametrize("name", ["lr=1,2 (b)", "it's", "[a]{b}:c", "a\\'b"])
+def test_a_run_in_any_folder_can_be_resumed(checkpoint, settings_of, name: str):
+    path = checkpoint("seed=3")
+    odd = path.parent.with_name(name)
+    path.parent.rename(odd)
+    settings = settings_of(f"resume={odd / 'checkpoint.pt'}")
+    assert (settings["folder"], settings["seed"]) == (str(odd), 3)
+    if "," not in name:
+        assert settings_of(f"folder={odd}")["folder"] == str(odd)
 
 
 def test_compose_is_what_the_command_line_would_be():

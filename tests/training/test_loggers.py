@@ -11,9 +11,9 @@ from pathlib import Path
 
 import pytest
 
-from vusfa.errors import ConfigError
+from vusfa.errors import ConfigError, ResultError
 from vusfa.training import make_loggers
-from vusfa.training.loggers import CSVLogger
+from vusfa.training.loggers import CSVLogger, Loggers
 from vusfa.training.trackers import TensorBoardLogger, WandbLogger
 
 CONFIG = {"agent": {"model": "vusfa"}, "seed": 3}
@@ -61,11 +61,50 @@ def test_a_new_csv_run_begins_a_new_file(tmp_path: Path):
     assert [row["loss"] for row in rows(tmp_path / "metrics.csv")] == ["2.0"]
 
 
-def test_csv_refuses_a_column_that_it_does_not_have(tmp_path: Path):
+def test_csv_takes_a_new_column(tmp_path: Path):
     log = CSVLogger(tmp_path, CONFIG)
     log.log_metrics({"loss": 1.0}, 10)
-    with pytest.raises(ValueError, match="'kl'"):
-        log.log_metrics({"kl": 1.0}, 20)
+    log.log_metrics({"loss": 2.0, "kl": 0.5}, 20)
+    resumed = CSVLogger(tmp_path, CONFIG, resume_frames=20)
+    resumed.log_metrics({"entropy": 3.0, "loss": 4.0}, 30)
+    assert rows(tmp_path / "metrics.csv") == [
+        {"frames": "10", "loss": "1.0", "kl": "", "entropy": ""},
+        {"frames": "20", "loss": "2.0", "kl": "0.5", "entropy": ""},
+        {"frames": "30", "loss": "4.0", "kl": "", "entropy": "3.0"},
+    ]
+
+
+@pytest.mark.parametrize("gone", ["file", "folder"])
+def test_csv_that_was_removed_does_not_come_back_without_a_header(tmp_path: Path, gone: str):
+    log = CSVLogger(tmp_path / "run", CONFIG)
+    log.log_metrics({"loss": 1.0}, 10)
+    if gone == "file":
+        (tmp_path / "run" / "metrics.csv").unlink()
+    else:
+        (tmp_path / "run").rename(tmp_path / "elsewhere")
+    with pytest.raises(ResultError, match=r"metrics\.csv: removed or renamed since the run began"):
+        log.log_metrics({"loss": 1.0}, 20)
+
+
+def test_a_tracker_that_fails_is_left_behind(capsys: pytest.CaptureFixture[str]):
+    heard = []
+
+    class Steady:
+        def log_metrics(self, metrics, frames: int) -> None:
+            heard.append(frames)
+
+        def close(self, exit_code: int = 0) -> None:
+            pass
+
+    class Full(Steady):
+        def log_metrics(self, metrics, frames: int) -> None:
+            raise OSError(28, "No space left on device")
+
+    with Loggers([Full(), Steady()]) as log:
+        log.log_metrics({}, 10)
+        log.log_metrics({}, 20)
+    assert heard == [10, 20]
+    assert capsys.readouterr().err.count("warning: Full has failed ([Errno 28] No space left on device)") == 1
 
 
 @pytest.mark.filterwarnings("default")  # TensorBoard's own imports warn
@@ -137,8 +176,6 @@ def test_an_exception_closes_loggers_with_a_failure():
     class Recorder:
         def close(self, exit_code: int = 0) -> None:
             codes.append(exit_code)
-
-    from vusfa.training.loggers import Loggers
 
     with Loggers([Recorder()]) as log:
         log.exit_code = 143

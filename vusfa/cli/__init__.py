@@ -11,7 +11,10 @@ import signal
 import sys
 from collections.abc import Sequence
 
+from vusfa.cli.interrupts import quiet_interrupts
+
 __all__ = ["COMMANDS", "TRAINING_COMMANDS", "main"]
+quiet_interrupts()  # here: the modules of this package import what takes seconds
 
 #: Modules that add commands, in the order in which ``--help`` shows them. A new command is a module with a
 #: function ``register(scenes)``, and a line here.

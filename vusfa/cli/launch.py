@@ -17,6 +17,7 @@ import os
 import re
 import sys
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -33,13 +34,14 @@ from vusfa.cli.resume import resumed_settings
 from vusfa.conf import FOLDER
 from vusfa.conf import compose as conf_compose
 from vusfa.conf.schema import check_overrides, mistake, near, register_schema, validated
-from vusfa.errors import VusfaError
+from vusfa.errors import ResultError, VusfaError, WorkerError
+from vusfa.files import say, use_own_temporary_folder
 from vusfa.modules.config import resolve_config
+from vusfa.training.folder import AUTO, found_checkpoint
 
 __all__ = ["compose", "launch"]
 
-BAD_INPUT = 2
-INTERRUPTED = 130
+FAILED, BAD_INPUT, INTERRUPTED = 1, 2, 130
 
 Job = Callable[[dict[str, Any], list[str]], int]
 
@@ -49,7 +51,8 @@ def launch(job: Job, folder: Path = FOLDER, name: str = "train") -> None:
     returns.
 
     What a user got wrong (:class:`~vusfa.errors.VusfaError`, or an error of Hydra's) ends in one line on
-    standard error and code 2. An error of ours keeps its traceback.
+    standard error and code 2; what the machine did not do (a worker died, the disk is full) in one line and
+    code 1; a signal in 128 and its number, which ends a sweep, too. An error of ours keeps its traceback.
 
     Args:
         job: gets the settings, plain and checked, and the command line's overrides.
@@ -60,6 +63,8 @@ def launch(job: Job, folder: Path = FOLDER, name: str = "train") -> None:
     os.environ["HYDRA_FULL_ERROR"] = "1"
     if "RL_LOGGING_LEVEL" not in os.environ:  # how TorchRL's log is asked for
         logging.getLogger("torchrl").setLevel(logging.WARNING)
+    use_own_temporary_folder()
+    sys.argv[1:] = [_quoted(argument) for argument in sys.argv[1:]]
     codes: list[int] = []
 
     def guarded(cfg: DictConfig) -> None:
@@ -67,13 +72,25 @@ def launch(job: Job, folder: Path = FOLDER, name: str = "train") -> None:
         # As typed: one with an interpolation would be resolved by being looked at.
         overrides: Any = OmegaConf.to_container(HydraConfig.get().overrides.task, resolve=False)
         codes.append(_report(lambda: job(_settled(cfg, overrides), overrides), folder))
+        if codes[-1] > 128:  # a signal is meant for all runs of a sweep; Hydra would begin the next
+            raise _Stopped
 
     def run() -> int:
         register_schema()
-        hydra.main(version_base="1.3", config_path=str(folder.resolve()), config_name=name)(guarded)()
+        with suppress(_Stopped):
+            hydra.main(version_base="1.3", config_path=str(folder.resolve()), config_name=name)(guarded)()
         return max(codes, default=0)  # a sweep has several; --help none
 
-    sys.exit(_report(run, folder))
+    code = _report(run, folder)
+    try:
+        sys.stdout.flush()
+    except OSError:  # whoever read it has gone
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    sys.exit(code)
+
+
+class _Stopped(BaseException):
+    """A signal has ended a run of a sweep."""
 
 
 def compose(folder: Path = FOLDER, name: str = "train", overrides: Sequence[str] = ()) -> DictConfig:
@@ -117,16 +134,38 @@ def _settled(cfg: DictConfig, overrides: Sequence[str]) -> dict[str, Any]:
     check_overrides(overrides)
     OmegaConf.resolve(cfg)
     context = HydraConfig.get()
-    if context.mode == RunMode.MULTIRUN and not any(name.startswith("folder=") for name in overrides):
+    if context.mode == RunMode.MULTIRUN and cfg.resume in (None, AUTO):
         # runs of one sweep may differ in what their folder's name does not tell, and begin in the same second
-        cfg.folder = context.runtime.output_dir
+        if cfg.folder is None:
+            cfg.folder = context.runtime.output_dir
+        elif not any(word.startswith("folder=") and set(word) & set(",$(") for word in sys.argv[1:]):
+            cfg.folder = str(Path(cfg.folder, str(context.job.num)))
     settings = validated(cfg)
+    if settings["resume"] == AUTO:
+        settings["resume"] = found_checkpoint(settings["folder"])
+        return settings
     return resumed_settings(settings, overrides) if settings["resume"] else settings
+
+
+def _quoted(argument: str) -> str:
+    """A path that Hydra would read as something else (``=``, ``,``, ``(``), in quotes.
+
+    >>> _quoted("resume=runs/lr=1,2/checkpoint.pt"), _quoted("resume=auto"), _quoted("seed=1,2")
+    ("resume='runs/lr=1,2/checkpoint.pt'", 'resume=auto', 'seed=1,2')
+    """
+    name, _, value = argument.partition("=")
+    odd = re.search(r"[=,()\[\]{}:\s'\"\\]", value) and value[:1] not in "'\"" and "${" not in value
+    if not odd or name not in ("resume", "folder") or (name == "folder" and "," in value):
+        return argument
+    escaped = re.sub(r"(\\*)'", lambda found: found[1] * 2 + "\\'", value)
+    return f"{name}='{escaped}'"
 
 
 def _report(job: Callable[[], int], folder: Path) -> int:
     try:
         return job()
+    except (WorkerError, ResultError) as error:
+        return _complain(str(error), FAILED)
     except VusfaError as error:
         return _complain(str(error))
     except (HydraException, OmegaConfBaseException) as error:
@@ -135,10 +174,15 @@ def _report(job: Callable[[], int], folder: Path) -> int:
         if "Config group override" not in str(error):  # Hydra's, of optim=null
             raise
         return _complain("a group of settings cannot be null; --help lists the choices of each")
+    except BrokenPipeError:
+        return FAILED
+    except OSError as error:
+        where = f"{error.filename}: " if error.filename else ""
+        return _complain(f"{where}{error.strerror or error}; a checkpoint written before is whole", FAILED)
     except KeyboardInterrupt:
         return _complain("interrupted; a checkpoint written before this is whole", INTERRUPTED)
 
 
 def _complain(message: str, code: int = BAD_INPUT) -> int:
-    print(f"error: {message}", file=sys.stderr)
+    say(f"error: {message}")
     return code

@@ -7,6 +7,8 @@ from typing import Any
 
 import typer
 
+from vusfa.files import say
+
 __all__ = ["register"]
 
 #: Hydra reads everything behind ``train`` itself, ``--help`` included.
@@ -36,8 +38,8 @@ def train(context: typer.Context) -> None:
         raise typer.Exit(1) from error
 
     def job(settings: dict[str, Any], overrides: list[str]) -> int:
-        exit_code = training.train(settings, overrides).exit_code
-        typer.echo(f"{settings['folder']}/checkpoint.pt", err=True)
+        trainer, _, exit_code = training.train(settings, overrides)
+        say(f"{trainer.settings['folder']}/checkpoint.pt")
         return exit_code
 
     sys.argv = ["vusfa train", *context.args]

@@ -32,7 +32,14 @@ ALGORITHMS: dict[str, Any] = {}
 #: Registered additional loss terms (:func:`vusfa.algorithms.register_loss_term`), with a coefficient of 0.
 LOSS_TERMS: dict[str, float] = {}
 #: Settings that a run divides by.
-POSITIVE = ("log_every", "checkpoint_every", "total_frames", "optim.horizon", "entropy.horizon")
+POSITIVE = (
+    "log_every",
+    "checkpoint_every",
+    "total_frames",
+    "optim.horizon",
+    "entropy.horizon",
+    "collector.timeout",
+)
 
 
 @dataclass
@@ -132,6 +139,7 @@ class CollectorSettings:
     num_envs: int
     rollout: int
     num_workers: int
+    timeout: float | None = 300.0
 
 
 @dataclass
@@ -140,7 +148,7 @@ class LoggerSettings:
 
     kinds: list[str]
     project: str
-    mode: str
+    mode: str | None
     name: str | None
 
 
@@ -183,7 +191,8 @@ class Settings:
     entropy: EntropySettings
     scenes: Any
     seed: int
-    folder: str
+    name: str
+    folder: str | None
     total_frames: int
     device: str
     threads: int
@@ -191,6 +200,7 @@ class Settings:
     log_every: int
     checkpoint_every: int
     resume: str | None
+    overwrite: bool
     by_model: dict[str, Any] = field(default_factory=dict)
 
 

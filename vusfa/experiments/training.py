@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Mapping, Sequence
+from contextlib import ExitStack, suppress
 from typing import Any, NamedTuple
 
 from omegaconf import DictConfig, OmegaConf
@@ -11,17 +11,20 @@ from omegaconf import DictConfig, OmegaConf
 from vusfa.conf.compose import compose
 from vusfa.conf.schema import register_schema
 from vusfa.evaluation import Comparison, check_comparison, compare, print_summary
-from vusfa.files import check_folder
+from vusfa.files import say
 from vusfa.training import (
     EvaluationProgress,
     ProgressLine,
+    RunFolder,
     StopOnSignal,
     Trainer,
     make_loggers,
     make_trainer,
     row_name,
+    run_training,
     set_threads,
 )
+from vusfa.training.folder import AUTO, CHECKPOINT, found_checkpoint
 
 __all__ = ["Trained", "compose_settings", "train"]
 
@@ -32,7 +35,7 @@ class Trained(NamedTuple):
     Attributes:
         trainer: with the trained agent.
         comparison: its evaluation, or None.
-        exit_code: 0, or 130 or 143 when a signal ended the training.
+        exit_code: 0, or 128 and the number of the signal that ended the training.
     """
 
     trainer: Trainer
@@ -49,7 +52,8 @@ def compose_settings(overrides: Sequence[str]) -> DictConfig:
 
 
 def train(settings: Mapping[str, Any], overrides: Sequence[str] = ()) -> Trained:
-    """Trains, and leaves metrics, a checkpoint and an evaluation in ``settings["folder"]``.
+    """Trains, and leaves metrics, a checkpoint and an evaluation in ``settings["folder"]`` (that of the
+    trainer's settings where the caller's are null).
 
     Args:
         settings: as in vusfa/conf/train.yaml, resolved.
@@ -57,36 +61,45 @@ def train(settings: Mapping[str, Any], overrides: Sequence[str] = ()) -> Trained
 
     Raises:
         VusfaError: settings that make no sense, or a checkpoint that does not fit them.
+        WorkerError, ResultError: see :func:`vusfa.training.run_training`.
     """
     plain: dict[str, Any] = _plain(settings)
+    plain = {"overwrite": False, "resume": None, "name": "run", **plain}
+    if plain["resume"] == AUTO:
+        plain["resume"] = found_checkpoint(plain["folder"])
     set_threads(plain["threads"])
-    checkpoint = check_folder(plain["folder"], "folder") / "checkpoint.pt"
+    folder = RunFolder(plain["folder"], plain)
     trainer = make_trainer(plain, overrides)
     if trainer.note is not None:
-        print(trainer.note, file=sys.stderr)
+        say(trainer.note)
     evaluated = plain["evaluation"]["goals"]
     if evaluated:
         check_comparison(trainer.scenes, **_evaluation(trainer))
     if plain["resume"]:
         for change in trainer.resume(plain["resume"]):
-            print(f"resumed with {change}", file=sys.stderr)
-    frames = trainer.frames if plain["resume"] else None
-    with make_loggers(
-        folder=plain["folder"],
-        config=plain,
-        run_id=trainer.run_id,
-        resume_frames=frames,
-        **plain["logger"],
-    ) as loggers:
+            say(f"resumed with {change}")
+    with ExitStack() as stack:
+        stack.enter_context(folder)
+        plain["folder"] = str(folder.path)
+        loggers = stack.enter_context(
+            make_loggers(
+                folder=folder.path,
+                config=plain,
+                run_id=trainer.run_id,
+                resume_frames=trainer.frames if plain["resume"] else None,
+                **plain["logger"],
+            )
+        )
         with StopOnSignal() as stop, ProgressLine(plain["total_frames"]) as progress:
-            trainer.run(checkpoint, loggers, stop, progress)
+            run_training(trainer, folder.path / CHECKPOINT, loggers, stop, progress)
         loggers.exit_code = stop.exit_code
         comparison = None
         if evaluated and not stop.received:
             comparison = _evaluate(trainer)
-            comparison.save(checkpoint.with_name("evaluation"))
+            comparison.save(folder.path / "evaluation")
             loggers.log_table("evaluation", comparison.rows, trainer.frames)
-            print_summary(comparison.rows, note=comparison.note)
+            with suppress(BrokenPipeError):
+                print_summary(comparison.rows, note=comparison.note)
     return Trained(trainer, comparison, stop.exit_code)
 
 

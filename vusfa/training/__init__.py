@@ -15,10 +15,12 @@ from vusfa.training.checkpoint import (
 )
 from vusfa.training.collectors import check_goals_dealt, make_collector, make_env
 from vusfa.training.facts import machine_facts, run_facts
+from vusfa.training.folder import RunFolder
 from vusfa.training.loggers import make_loggers
 from vusfa.training.metrics import EpisodeMeter, MeanMeter
 from vusfa.training.optimization import descend, make_optimizer, total_loss
 from vusfa.training.progress import EvaluationProgress, ProgressLine
+from vusfa.training.run import run_training
 from vusfa.training.setup import make_observation, make_trainer, row_name, set_threads, torch_device
 from vusfa.training.signals import StopOnSignal
 from vusfa.training.trainer import Trainer
@@ -28,6 +30,7 @@ __all__ = [
     "EvaluationProgress",
     "MeanMeter",
     "ProgressLine",
+    "RunFolder",
     "StopOnSignal",
     "Trainer",
     "check_goals_dealt",
@@ -44,6 +47,7 @@ __all__ = [
     "rebuild_agent",
     "row_name",
     "run_facts",
+    "run_training",
     "save_checkpoint",
     "scene_sources",
     "set_threads",

@@ -79,7 +79,13 @@ def save_checkpoint(path: str | Path, state: Mapping[str, Any]) -> Path:
     'a.pt'
     """
     with replacing(path) as unfinished:
-        torch.save({"format": FORMAT, **state}, unfinished)
+        try:
+            with open(unfinished, "wb") as file:
+                torch.save({"format": FORMAT, **state}, file)
+        except RuntimeError as error:  # torch's own, after a disk that is full
+            if isinstance(error.__context__, OSError):
+                raise error.__context__ from error
+            raise
     return Path(path)
 
 

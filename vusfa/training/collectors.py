@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import reprlib
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -26,11 +26,11 @@ from torchrl.envs import EnvBase, TransformedEnv
 from torchrl.envs.transforms import Compose, Transform
 
 from vusfa.envs import TargetNavEnv
-from vusfa.errors import CheckpointError, ConfigError
+from vusfa.errors import CheckpointError, ConfigError, WorkerError
 from vusfa.scenes import SceneSet
 from vusfa.torchrl_private import carrier, end_weight_sharing, put_carrier
 from vusfa.training.content import check_like, mended, restore
-from vusfa.training.signals import ignore_interrupts
+from vusfa.training.workers import begin_worker, started, watch
 
 __all__ = [
     "KINDS",
@@ -118,6 +118,7 @@ def make_collector(
     num_workers: int = 1,
     seed: int = 0,
     autocast: bool = False,
+    timeout: float | None = None,
 ) -> BaseCollector:
     """Collector without an end; the caller counts frames.
 
@@ -132,9 +133,11 @@ def make_collector(
         seed: of the environments and the workers' draws of actions.
         autocast: workers compute in bfloat16 where that is safe; in this process the caller decides, by
             collecting within :class:`torch.autocast`.
+        timeout: seconds after which a worker that sends nothing counts as dead; None: never.
 
     Raises:
         ConfigError: see :func:`rows_per_worker`.
+        WorkerError: the workers cannot start.
     """
     rows = rows_per_worker(kind, num_envs, num_workers)
     if rollout < 1:
@@ -159,26 +162,18 @@ def make_collector(
     shared |= {
         "num_threads": threads,
         "num_sub_threads": 1,
-        "init_fn": partial(_begin_worker, autocast),
+        "init_fn": partial(begin_worker, autocast),
     }
-    if kind == "multi_sync":
-        collector: BaseCollector = MultiSyncCollector(
-            makers, policy, frames_per_batch=num_envs * rollout, cat_results=0, **shared
-        )
-    else:
-        collector = MultiAsyncCollector(makers, policy, frames_per_batch=rows * rollout, **shared)
-    collector.set_seed(seed)
+    with started(None if timeout is None else max(timeout, 120.0)):
+        if kind == "multi_sync":
+            collector: BaseCollector = MultiSyncCollector(
+                makers, policy, frames_per_batch=num_envs * rollout, cat_results=0, **shared
+            )
+        else:
+            collector = MultiAsyncCollector(makers, policy, frames_per_batch=rows * rollout, **shared)
+        collector.set_seed(seed)
+    watch(collector, timeout)
     return collector
-
-
-def _begin_worker(autocast: bool) -> None:
-    """Initialization of every worker process."""
-    ignore_interrupts()
-    if autocast:
-        torch.set_autocast_dtype("cpu", torch.bfloat16)
-        torch.set_autocast_enabled("cpu", True)
-        # The cache would keep weights converted before an update for as long as the worker lives.
-        torch.set_autocast_cache_enabled(False)
 
 
 @contextmanager
@@ -188,11 +183,18 @@ def opened(make: Callable[[], BaseCollector]) -> Iterator[BaseCollector]:
     A collector with workers changes this process's number of threads; that is put right.
     """
     threads = torch.get_num_threads()
-    collector = make()
     try:
-        yield collector
+        collector = make()
+        try:
+            yield collector
+        except WorkerError:
+            for worker in getattr(collector, "procs", ()):  # they would wait for the one that is gone
+                with suppress(ValueError):
+                    worker.kill()
+            raise
+        finally:
+            close_collector(collector)
     finally:
-        close_collector(collector)
         torch.set_num_threads(threads)
 
 

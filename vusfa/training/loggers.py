@@ -15,8 +15,8 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Protocol
 
-from vusfa.errors import ConfigError
-from vusfa.files import write_csv, write_json
+from vusfa.errors import ConfigError, ResultError, VusfaError
+from vusfa.files import cannot_write, say, write_csv, write_json
 from vusfa.training.trackers import TensorBoardLogger, WandbLogger
 
 __all__ = ["CSVLogger", "Logger", "Loggers", "make_loggers"]
@@ -84,18 +84,31 @@ class CSVLogger:
             write_csv(self._file, kept, self._columns)
 
     def log_metrics(self, metrics: Mapping[str, float], frames: int) -> None:
-        """Append one row; the first row sets the columns."""
+        """Append one row; a column that earlier rows do not have is empty there.
+
+        Raises:
+            ResultError: the file cannot be written, or is gone.
+        """
         self._begin()
         row = {"frames": frames, **metrics}
-        new = self._columns is None
+        if self._columns is not None and not self._file.is_file():
+            raise ResultError(f"{self._file}: removed or renamed since the run began; its folder must stay")
+        if self._columns is not None and set(row) - set(self._columns):
+            with open(self._file, newline="", encoding="utf-8") as file:
+                earlier = list(csv.DictReader(file))
+            self._columns = list(dict.fromkeys([*self._columns, *row]))
+            write_csv(self._file, earlier, self._columns)
+        try:
+            with open(self._file, "a", newline="", encoding="utf-8") as file:
+                writer = csv.DictWriter(file, self._columns or list(row), lineterminator="\n")
+                if self._columns is None:
+                    writer.writeheader()
+                writer.writerow(
+                    {k: "" if isinstance(v, float) and math.isnan(v) else v for k, v in row.items()}
+                )
+        except OSError as error:
+            raise cannot_write(self._file, error) from error
         self._columns = self._columns or list(row)
-        if set(row) - set(self._columns):
-            raise ValueError(f"metrics.csv has no column {sorted(set(row) - set(self._columns))[0]!r}")
-        with open(self._file, "a", newline="", encoding="utf-8") as file:
-            writer = csv.DictWriter(file, self._columns, lineterminator="\n")
-            if new:
-                writer.writeheader()
-            writer.writerow({k: "" if isinstance(v, float) and math.isnan(v) else v for k, v in row.items()})
 
     def log_checkpoint(self, path: Path, frames: int) -> None:
         """Nothing to do: the file itself is the record."""
@@ -131,23 +144,31 @@ class Loggers:
 
     def log_metrics(self, metrics: Mapping[str, float], frames: int) -> None:
         """See :class:`Logger`."""
-        for logger in self.loggers:
-            logger.log_metrics(metrics, frames)
+        self._tell("log_metrics", metrics, frames)
 
     def log_checkpoint(self, path: Path, frames: int) -> None:
         """See :class:`Logger`."""
-        for logger in self.loggers:
-            logger.log_checkpoint(path, frames)
+        self._tell("log_checkpoint", path, frames)
 
     def log_table(self, name: str, rows: Sequence[Mapping[str, Any]], frames: int) -> None:
         """See :class:`Logger`."""
-        for logger in self.loggers:
-            logger.log_table(name, rows, frames)
+        self._tell("log_table", name, rows, frames)
 
     def close(self, exit_code: int = 0) -> None:
         """See :class:`Logger`."""
+        self._tell("close", exit_code)
+
+    def _tell(self, method: str, *arguments: Any) -> None:
+        """Tells each logger; a tracker whose disk or network fails is left behind, the run goes on."""
         for logger in self.loggers:
-            logger.close(exit_code)
+            try:
+                getattr(logger, method)(*arguments)
+            except VusfaError:
+                raise
+            except (OSError, RuntimeError, TimeoutError) as error:
+                name, reason = type(logger).__name__, " ".join(str(error).split())
+                say(f"warning: {name} has failed ({reason}); the run goes on without it")
+                self.loggers = tuple(other for other in self.loggers if other is not logger)
 
 
 def make_loggers(
@@ -158,7 +179,7 @@ def make_loggers(
     run_id: str,
     resume_frames: int | None = None,
     project: str = "vusfa",
-    mode: str = "online",
+    mode: str | None = None,
     name: str | None = None,
 ) -> Loggers:
     """Loggers by name: ``csv``, ``tensorboard``, ``wandb``.

@@ -6,6 +6,7 @@ import math
 import time
 from collections import deque
 from collections.abc import Callable
+from contextlib import suppress
 from types import TracebackType
 from typing import TYPE_CHECKING
 
@@ -42,6 +43,8 @@ class ProgressLine:
         self._total = total
         self._unit = unit
         self._console = console or Console(stderr=True)
+        # whoever read the line may go away: that ends no training
+        self._console.on_broken_pipe = lambda: None  # type: ignore[method-assign]
         self._every = every
         self._clock = clock
         self._recent: deque[tuple[float, int]] = deque(maxlen=200)
@@ -82,14 +85,16 @@ class ProgressLine:
 
     def close(self) -> None:
         """Finish, leaving the last line."""
-        if self._live is not None:
-            self._live.stop()
-        elif self._line:
-            self._print(self._clock())
+        with suppress(OSError):
+            if self._live is not None:
+                self._live.stop()
+            elif self._line:
+                self._print(self._clock())
 
     def _print(self, now: float) -> None:
         self._printed = now
-        self._console.print(self._line, soft_wrap=True, highlight=False)
+        with suppress(OSError):
+            self._console.print(self._line, soft_wrap=True, highlight=False)
 
 
 class EvaluationProgress:

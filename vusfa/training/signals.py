@@ -1,4 +1,4 @@
-"""Ctrl-C and SIGTERM end a training after the current update."""
+"""Ctrl-C, SIGTERM and SIGHUP end a training after the current update."""
 
 from __future__ import annotations
 
@@ -6,11 +6,15 @@ import signal
 from types import FrameType, TracebackType
 from typing import Any
 
-__all__ = ["StopOnSignal", "ignore_interrupts"]
+__all__ = ["StopOnSignal"]
+
+_STOPPING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
 class StopOnSignal:
-    """Context manager: the first SIGINT or SIGTERM is recorded; a second one acts at once.
+    """Context manager: the first SIGINT, SIGTERM or SIGHUP is recorded; a second one acts at once.
+
+    A hang-up that is ignored (``nohup``) stays ignored.
 
     Attributes:
         received: number of the signal, or None.
@@ -32,14 +36,18 @@ class StopOnSignal:
         return 128 + self.received if self.received is not None else 0
 
     def __enter__(self) -> StopOnSignal:
-        for number in (signal.SIGINT, signal.SIGTERM):
-            self._before[number] = signal.signal(number, self._note)
+        for number in _STOPPING:
+            if number != signal.SIGHUP or signal.getsignal(number) != signal.SIG_IGN:
+                self._before[number] = signal.signal(number, self._note)
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self._restore()
+        # within autograd, or a library's callback, a second Ctrl-C comes out as an error of theirs
+        if isinstance(error, Exception) and _caused_by_interrupt(error):
+            raise KeyboardInterrupt from error
 
     def _note(self, number: int, frame: FrameType | None) -> None:
         self.received = number
@@ -51,6 +59,9 @@ class StopOnSignal:
             signal.signal(number, handler)
 
 
-def ignore_interrupts() -> None:
-    """Ignore Ctrl-C in a worker process: a terminal sends it to all, and the main process decides."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+def _caused_by_interrupt(error: BaseException | None) -> bool:
+    while error is not None:
+        if isinstance(error, KeyboardInterrupt) or "KeyboardInterrupt" in str(error):
+            return True
+        error = error.__cause__ or error.__context__
+    return False

@@ -61,7 +61,8 @@ class WandbLogger:
         config: the run's configuration.
         run_id: the run's id; one that exists already is continued.
         project: wandb's project.
-        mode: ``"online"``, ``"offline"`` or ``"disabled"``.
+        mode: ``"online"``, ``"offline"`` or ``"disabled"``; None for the environment's ``WANDB_MODE``, online
+            without.
         name: the run's name; wandb makes one up without.
     """
 
@@ -71,13 +72,13 @@ class WandbLogger:
         config: Mapping[str, Any],
         run_id: str,
         project: str = "vusfa",
-        mode: str = "online",
+        mode: str | None = None,
         name: str | None = None,
     ) -> None:
         import wandb
 
         modes = ("online", "offline", "disabled")
-        if mode not in modes:
+        if mode is not None and mode not in modes:
             raise ConfigError(f"logger.mode is {mode!r}; it must be one of {', '.join(modes)}")
         files = Path(folder) / "wandb"
         missing = [place for place in (files, *files.parents) if not place.exists()]

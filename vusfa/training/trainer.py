@@ -36,13 +36,11 @@ from vusfa.training.checkpoint import (
 )
 from vusfa.training.collectors import collector_state, load_collector_state, opened
 from vusfa.training.content import check_like, restore
-from vusfa.training.loggers import Logger
 from vusfa.training.metrics import EpisodeMeter, MeanMeter
 from vusfa.training.optimization import descend, total_loss
 from vusfa.training.precision import resolve_autocast
-from vusfa.training.progress import ProgressLine
 from vusfa.training.random_state import check_random_state, random_state, restore_random_state
-from vusfa.training.signals import StopOnSignal
+from vusfa.training.workers import supervised
 
 __all__ = ["Trainer"]
 
@@ -127,6 +125,8 @@ class Trainer:
             if isinstance(collector, Collector):
                 frames = collector.requested_frames_per_batch
                 stack.enter_context(self.acting.cached(self.goals, self.scenes, frames))
+            if collector is not None:
+                stack.enter_context(supervised(collector))
             return next(batches)
 
     def update(self, batches: Iterator[TensorDictBase]) -> tuple[TensorDictBase, dict[str, Tensor]]:
@@ -169,31 +169,6 @@ class Trainer:
         self.terms.update(terms)
         self.seconds += time.monotonic() - began
         return batch, terms
-
-    def run(self, checkpoint: Path, loggers: Logger, stop: StopOnSignal, progress: ProgressLine) -> None:
-        """Updates until ``total_frames`` or a signal, with lines of the log and checkpoints.
-
-        Args:
-            checkpoint: file, written at intervals and at the end.
-            loggers: get metrics and checkpoints.
-            stop: looked at after each update.
-            progress: the live line.
-        """
-        total, log_every = self.settings["total_frames"], self.settings["log_every"]
-        checkpoint_every = self.settings["checkpoint_every"]
-        with self.collecting() as batches:
-            while self.frames < total and not stop.received:
-                before = self.frames
-                self.update(batches)
-                progress.update(self.frames)
-                ended = self.frames >= total  # a short training is logged, too
-                if ended or before // log_every < self.frames // log_every:
-                    metrics = self.metrics()
-                    loggers.log_metrics(metrics, self.frames)
-                    progress.rates(metrics["success"], metrics["length_ratio"])
-                if before // checkpoint_every < self.frames // checkpoint_every:
-                    loggers.log_checkpoint(self.save(checkpoint), self.frames)
-            loggers.log_checkpoint(self.save(checkpoint), self.frames)
 
     def metrics(self) -> dict[str, float]:
         """A line of the log: what the meters hold, which begin anew, and how far the training has come.

@@ -4,16 +4,29 @@ promise."""
 from __future__ import annotations
 
 import shlex
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from omegaconf import OmegaConf
+from omegaconf import DictConfig, OmegaConf
 
 from vusfa.cli.launch import compose
 from vusfa.conf import FOLDER as CONF
 
 RECIPES = Path(__file__).parents[2] / "recipes"
 FILES = sorted(CONF.rglob("*.yaml"))
+
+
+@pytest.fixture
+def settings() -> Callable[..., DictConfig]:
+    """Settings as the command line would make them, interpolations resolved."""
+
+    def made(*overrides: str, name: str = "train") -> DictConfig:
+        cfg = compose(CONF, name, overrides)
+        OmegaConf.resolve(cfg)
+        return cfg
+
+    return made
 
 
 @pytest.mark.parametrize("path", FILES, ids=lambda path: str(path.relative_to(CONF)))
@@ -106,7 +119,7 @@ def test_fast_is_controlled_but_for_the_clock(settings):
     """The four models differ in nothing but their ideas: what fast changes, it changes for all of them."""
     fast, controlled = settings("preset=fast", "folder=here"), settings("preset=controlled", "folder=here")
     for key in fast:
-        if key not in ("agent", "optim"):
+        if key not in ("agent", "optim", "name"):
             assert fast[key] == controlled[key]
     assert {key for key in fast.agent if fast.agent[key] != controlled.agent[key]} == {"history"}
     assert (fast.agent.architecture, fast.agent.history, fast.agent.hidden_size) == ("controlled", 1, 256)
@@ -124,7 +137,9 @@ def test_the_numbers_of_controlled(settings):
         "max_grad_norm": 1.0,
         "options": {"eps": 1e-5, "fused": True},
     }
-    assert cfg.collector == {"kind": "single", "num_envs": 256, "rollout": 50, "num_workers": 1}
+    assert cfg.collector == {"kind": "single", "num_envs": 256, "rollout": 50, "num_workers": 1} | {
+        "timeout": 300.0
+    }
     assert cfg.env.goal_sampling == "episode"
     assert cfg.entropy == {"start": 0.005, "end": 0.001, "horizon": 6_000_000}
     assert (cfg.total_frames, cfg.autocast) == (6_000_000, True)

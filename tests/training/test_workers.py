@@ -1,0 +1,147 @@
+"""Worker processes that die, stop, or do not begin: one line that names them, nothing left running."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import queue
+import re
+import signal
+import time
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from omegaconf import OmegaConf
+
+from vusfa.cli.launch import compose
+from vusfa.errors import ResultError, WorkerError
+from vusfa.training import StopOnSignal, Trainer, load_checkpoint, make_trainer, run_training
+from vusfa.training.workers import _WatchedQueue, started
+
+SMALL = ["agent.hidden_size=8", "agent.embedding_size=8", "agent.history=1", "env.goals=[3,9,12]"]
+SMALL += ["collector.num_envs=6", "collector.rollout=4", "scenes=[bathroom]", "total_frames=1000000"]
+
+
+class Deaf:
+    """A logger and a line of progress that do something after a number of updates."""
+
+    def __init__(self, act: Callable[[Trainer], None], after: int = 3) -> None:
+        self.act, self.left = act, after
+        self.trainer: Trainer
+
+    def update(self, frames: int) -> None:
+        self.left -= 1
+        if self.left == 0:
+            self.act(self.trainer)
+
+    def rates(self, *_: float) -> None:
+        pass
+
+    log_metrics = log_checkpoint = rates
+
+
+def ended_by(act: Callable[[Trainer], None], path: Path, *overrides: str) -> str:
+    """What a training says that something happens to."""
+    settings: Any = OmegaConf.to_container(compose(overrides=[*SMALL, *overrides]), resolve=True)
+    deaf = Deaf(act)
+    deaf.trainer = trainer = make_trainer(settings)
+    with StopOnSignal() as stop, pytest.raises((WorkerError, ResultError)) as error:
+        run_training(trainer, path, deaf, stop, deaf)  # type: ignore[arg-type]
+    assert "\n" not in str(error.value)
+    assert not multiprocessing.active_children()
+    return str(error.value)
+
+
+def signal_worker(number: int, trainer: Trainer) -> None:
+    assert trainer._collector is not None
+    os.kill(trainer._collector.procs[1].pid, number)
+
+
+@pytest.mark.usefixtures("fast_workers")
+@pytest.mark.parametrize(
+    ("kind", "number"),
+    [("multi_sync", signal.SIGKILL), ("multi_async", signal.SIGTERM), ("multi_async", signal.SIGSEGV)],
+)
+def test_a_worker_that_dies(tmp_path: Path, kind: str, number: signal.Signals):
+    path = tmp_path / "checkpoint.pt"
+    text = ended_by(partial(signal_worker, number), path, f"collector={kind}")
+    assert text.startswith("worker 1 of the collector (process ")
+    assert f"was ended by {number.name}" in text
+    frames = load_checkpoint(path)["frames"]
+    assert frames >= 36
+    assert text.endswith(f"all {frames} frames are in {path}: resume it")
+
+
+@pytest.mark.usefixtures("fast_workers")
+@pytest.mark.parametrize("kind", ["multi_sync", "multi_async"])
+def test_a_worker_that_is_stopped(tmp_path: Path, kind: str):
+    """In multi_async the others go on sending."""
+    began = time.monotonic()
+    stop = partial(signal_worker, signal.SIGSTOP)
+    text = ended_by(stop, tmp_path / "a.pt", f"collector={kind}", "collector.timeout=1.5")
+    assert re.match(r"worker (0 .*, )?1 \(process \d+\) of the collector has sent nothing for 1.5 s", text)
+    assert load_checkpoint(tmp_path / "a.pt")["frames"] >= 36
+    assert time.monotonic() - began < 60
+
+
+def test_a_disk_that_is_full_when_the_log_is_written(tmp_path: Path):
+    def full(_: Trainer) -> None:
+        raise ResultError("metrics.csv: cannot be written (No space left on device)")
+
+    text = ended_by(full, tmp_path / "a.pt")
+    assert text.startswith("metrics.csv: cannot be written (No space left on device); ")
+    assert text.endswith(f"; all 72 frames are in {tmp_path}/a.pt: resume it")
+    (tmp_path / "b.pt").mkdir()  # and no checkpoint can be written either
+    assert ended_by(full, tmp_path / "b.pt").endswith("; there is no checkpoint yet")
+
+
+@pytest.mark.parametrize(
+    ("seconds", "limit", "words"),
+    [(1.3, 20.0, "ended with exit code 0"), (60.0, 0.1, "not begun within 0.1 s")],
+)
+def test_workers_that_do_not_begin(seconds: float, limit: float, words: str):
+    def start() -> None:
+        with started(limit):
+            multiprocessing.get_context("fork").Process(target=time.sleep, args=(seconds,)).start()
+            time.sleep(30)  # TorchRL waits for a pipe
+
+    with pytest.raises(WorkerError, match=f"cannot start: .*{words}.*collector.num_workers"):
+        start()
+    assert not multiprocessing.active_children()
+
+
+def test_a_system_that_refuses_processes():
+    with pytest.raises(WorkerError, match=r"cannot start: .*Too many open files; give fewer"), started(None):
+        raise OSError(24, "Too many open files")
+
+
+def test_time_in_which_the_training_itself_was_stopped_does_not_count(monkeypatch: pytest.MonkeyPatch):
+    now = [0.0]
+    monkeypatch.setattr("vusfa.training.workers.time.monotonic", lambda: now[0])
+
+    class Worker:
+        pid, exitcode = 1, None
+
+    results: queue.Queue[Any] = queue.Queue()
+    watched = _WatchedQueue(results, [Worker(), Worker()], 60.0)
+    now[0] = 3600.0  # Ctrl-Z, and fg after lunch
+    with pytest.raises(queue.Empty):
+        watched.get(timeout=0.01)
+    results.put((1, 0))
+    assert watched.get() == (1, 0)
+    results.put(((torch.zeros(1), 0), 0))
+    watched.get()
+    for _ in range(10):
+        now[0] += 10.0
+        results.put((1, 0))
+        if now[0] > 3660.0:
+            with pytest.raises(WorkerError, match=r"worker 0 .* has sent nothing for 60 s"):
+                watched.get()
+            break
+        watched.get()
+    else:
+        pytest.fail("the silence of worker 0 was not seen")

@@ -1,0 +1,149 @@
+"""Folder of a run: one process writes to it, no run is overwritten unasked, nothing of a dead one stays."""
+
+from __future__ import annotations
+
+import fcntl
+import itertools
+import os
+import re
+import time
+from collections.abc import Mapping
+from contextlib import suppress
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+from vusfa.errors import ConfigError
+from vusfa.files import check_folder, remove_leftovers
+
+__all__ = ["AUTO", "CHECKPOINT", "RunFolder", "default_folder", "found_checkpoint"]
+
+#: ``resume`` of a run that goes on if there is something to go on with.
+AUTO = "auto"
+
+CHECKPOINT = "checkpoint.pt"
+_OF_A_RUN = (CHECKPOINT, "metrics.csv", "evaluation.csv", "evaluation.json", "evaluation_episodes.csv")
+_LOCK = ".lock"
+
+
+def default_folder(settings: Mapping[str, Any]) -> Path:
+    """Folder of a run that was given none: preset, model, scenes, seed, and the time.
+
+    >>> settings = {"name": "fast", "agent": {"model": "gvf"}, "scenes": ["bathroom", "x/y.h5"], "seed": 3}
+    >>> str(default_folder(settings).parent)
+    'runs/fast-gvf-bathroom+y-seed3'
+    """
+    scenes = [settings["scenes"]] if isinstance(settings["scenes"], str) else settings["scenes"]
+    stems = [Path(scene).stem for scene in scenes]
+    shown = "+".join(stems) if len(stems) <= 3 else f"{len(stems)}_scenes"
+    parts = settings["name"], settings["agent"]["model"], shown, f"seed{settings['seed']}"
+    name = re.sub(r"[^\w.+-]", "_", "-".join(parts))
+    return Path("runs", name[:120], time.strftime("%Y-%m-%d_%H-%M-%S"))
+
+
+def found_checkpoint(folder: str | Path | None) -> str | None:
+    """The checkpoint that ``resume=auto`` goes on with, or None.
+
+    Raises:
+        ConfigError: no folder was given.
+    """
+    if folder is None:
+        raise ConfigError("resume=auto looks into the run's folder; give folder=, too")
+    path = Path(folder, CHECKPOINT)
+    return str(path) if path.is_file() else None
+
+
+class RunFolder:
+    """Context in which this process alone writes to a run's folder.
+
+    Args:
+        path: the folder; None for :func:`default_folder`, which no other run gets.
+        settings: of the run: ``resume``, ``overwrite``, and what the default's name says.
+
+    Attributes:
+        path: the folder; made on entry.
+
+    Raises:
+        ConfigError: it cannot be written, or a run is in it, or is being written to it.
+    """
+
+    def __init__(self, path: str | Path | None, settings: Mapping[str, Any]) -> None:
+        self._settings, self._unnamed = settings, path is None
+        self.path = default_folder(settings) if path is None else check_folder(path, "folder")
+        check_folder(self.path, "folder")
+        self._made: list[Path] = []
+        self._lock: int | None = None
+        if not self._unnamed:
+            self._refuse_other_run()
+
+    def __enter__(self) -> RunFolder:
+        self._make()
+        self._refuse_other_run()
+        remove_leftovers(self.path)
+        if self._settings["overwrite"] and not self._resumes_here():
+            for name in _OF_A_RUN:
+                with suppress(OSError):
+                    (self.path / name).unlink()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        with suppress(OSError):
+            (self.path / _LOCK).unlink()
+        if self._lock is not None:
+            os.close(self._lock)
+        for place in reversed(self._made):  # a run that did not begin leaves nothing
+            with suppress(OSError):
+                place.rmdir()
+
+    def _make(self) -> None:
+        base = self.path
+        for number in itertools.count(2):
+            missing = [place for place in (self.path, *self.path.parents) if not place.exists()]
+            try:
+                self.path.parent.mkdir(parents=True, exist_ok=True)
+                self.path.mkdir(exist_ok=not self._unnamed)
+                self._made = missing[::-1]
+                return self._claim()
+            except FileExistsError as error:
+                if not self._unnamed:
+                    raise ConfigError(f"folder is '{self.path}', which is a file; give another") from error
+                self.path = base.with_name(f"{base.name}-{number}")
+            except OSError as error:
+                raise ConfigError(f"folder is '{self.path}': {error.strerror}; give another") from error
+
+    def _claim(self) -> None:
+        """Takes the lock; it goes with this process, however that ends."""
+        self._lock = os.open(self.path / _LOCK, os.O_RDWR | os.O_CREAT, 0o644)
+        try:
+            fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            writer = os.read(self._lock, 20).decode("ascii", "replace")
+            os.close(self._lock)
+            self._lock = None
+            raise ConfigError(
+                f"folder is '{self.path}', where process {writer} is writing a run; wait for it, or give"
+                " another folder"
+            ) from error
+        except OSError:
+            pass  # a file system without locks
+        with suppress(FileNotFoundError):
+            if os.path.samestat(os.fstat(self._lock), os.stat(self.path / _LOCK)):
+                os.ftruncate(self._lock, 0)
+                os.write(self._lock, str(os.getpid()).encode())
+                return
+        os.close(self._lock)  # its run has just ended and removed it
+        self._claim()
+
+    def _resumes_here(self) -> bool:
+        resume = self._settings["resume"]
+        return resume is not None and Path(resume).resolve().parent == self.path.resolve()
+
+    def _refuse_other_run(self) -> None:
+        taken = os.path.lexists(self.path / CHECKPOINT)
+        if taken and not self._settings["overwrite"] and not self._resumes_here():
+            raise ConfigError(
+                f"folder is '{self.path}', where a run is already ({CHECKPOINT}); give resume=auto to go on"
+                " with it, another folder, or overwrite=true to replace it"
+            )

@@ -1,0 +1,194 @@
+"""Supervision of a collector's worker processes: one that dies, or says nothing for too long, is an error
+that names it; none outlives the training."""
+
+from __future__ import annotations
+
+import ctypes
+import multiprocessing
+import os
+import queue
+import resource
+import signal
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from types import FrameType
+from typing import Any
+
+import torch
+from torchrl.collectors import BaseCollector
+
+from vusfa.errors import VusfaError, WorkerError
+
+__all__ = ["begin_worker", "started", "supervised", "watch"]
+
+#: What one wait, or one update between two waits, counts at most towards a time limit, in seconds: a
+#: training that was suspended (Ctrl-Z, a laptop's lid) does not hold that against its workers.
+LONGEST_WAIT = 10.0
+_PR_SET_PDEATHSIG = 1
+
+
+def begin_worker(autocast: bool) -> None:
+    """Initialization of every worker process.
+
+    A terminal sends Ctrl-C and its hang-up to all processes; the main one decides. Where that is killed, a
+    worker ends, too.
+    """
+    for number in (signal.SIGINT, signal.SIGHUP):
+        signal.signal(number, signal.SIG_IGN)
+    if sys.platform.startswith("linux"):
+        with suppress(AttributeError, OSError):
+            ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
+    parent = multiprocessing.parent_process()
+    if parent is not None and not parent.is_alive():  # killed while this process was starting
+        os._exit(1)
+    if autocast:
+        torch.set_autocast_dtype("cpu", torch.bfloat16)
+        torch.set_autocast_enabled("cpu", True)
+        # The cache would keep weights converted before an update for as long as the worker lives.
+        torch.set_autocast_cache_enabled(False)
+
+
+@contextmanager
+def started(limit: float | None) -> Iterator[None]:
+    """Context in which workers start.
+
+    Raises:
+        WorkerError: one dies, or all together take longer than ``limit`` seconds (None: any time), or the
+            system refuses processes, memory or files. Those that did start are ended.
+    """
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    if soft != hard:  # a worker takes about ten
+        with suppress(OSError, ValueError):
+            resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))
+    before, began = set(multiprocessing.active_children()), time.monotonic()
+    seen: set[Any] = set()
+
+    def look(number: int, frame: FrameType | None) -> None:
+        seen.update(child for child in multiprocessing.active_children() if child not in before)
+        dead = [_end_of(child.pid, child.exitcode) for child in seen if child.exitcode is not None]
+        if dead:
+            raise WorkerError(dead[0])
+        if limit is not None and time.monotonic() - began > limit:
+            raise WorkerError(f"they have not begun within {limit:g} s (collector.timeout)")
+
+    try:
+        with _every_second(look):
+            yield
+    except Exception as error:
+        for child in set(multiprocessing.active_children()) - before:
+            child.kill()
+            child.join()
+        if isinstance(error, VusfaError) and not isinstance(error, WorkerError):
+            raise
+        reason = " ".join(str(error).split("\n")[0].split()) or type(error).__name__
+        raise WorkerError(
+            f"the collector's workers cannot start: {reason}; give fewer collector.num_workers, or allow more"
+            " memory, processes and open files (ulimit)"
+        ) from error
+
+
+@contextmanager
+def _every_second(look: Callable[[int, FrameType | None], None]) -> Iterator[None]:
+    """Calls a function every second, even while the main thread waits; not in another thread."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    handler = signal.signal(signal.SIGALRM, look)
+    signal.setitimer(signal.ITIMER_REAL, 1.0, 1.0)
+    try:
+        yield
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0.0)
+        signal.signal(signal.SIGALRM, handler)
+
+
+def watch(collector: BaseCollector, limit: float | None) -> None:
+    """Has a collector with workers look after them while it waits for a batch.
+
+    Args:
+        collector: begun; any other than one with workers stays as it is.
+        limit: seconds without a batch after which a worker counts as dead; None: any time.
+    """
+    if hasattr(collector, "procs"):
+        collector.queue_out = _WatchedQueue(collector.queue_out, collector.procs, limit)
+
+
+@contextmanager
+def supervised(collector: BaseCollector) -> Iterator[None]:
+    """Context in which a batch is waited for: what TorchRL raises when a worker has died names the worker.
+
+    Raises:
+        WorkerError: a worker has died, or has been silent for too long.
+    """
+    try:
+        yield
+    except (RuntimeError, OSError, EOFError) as error:
+        dead = _dead(getattr(collector, "procs", ()))
+        if not dead:
+            raise
+        raise WorkerError(dead) from error
+
+
+class _WatchedQueue:
+    """The queue on which workers announce their batches."""
+
+    def __init__(self, results: Any, workers: Sequence[Any], limit: float | None) -> None:
+        self._results, self._workers, self._limit = results, workers, limit
+        self._clock, self._last = 0.0, time.monotonic()
+        self._heard = [0.0] * len(workers)
+
+    def get(self, timeout: float | None = None) -> Any:
+        """As a queue's ``get``.
+
+        Raises:
+            WorkerError: a worker has died, or has been silent for too long.
+        """
+        try:
+            item = self._results.get(timeout=timeout)
+        except queue.Empty:
+            self._look()
+            raise
+        announced = item[0][1] if isinstance(item[0], tuple) else item[0]
+        self._look()
+        self._heard[announced] = self._clock
+        return item
+
+    def _look(self) -> None:
+        now = time.monotonic()
+        self._clock += min(now - self._last, LONGEST_WAIT)
+        self._last = now
+        dead = _dead(self._workers)
+        if dead:
+            raise WorkerError(dead)
+        silent = [i for i, heard in enumerate(self._heard) if self._clock - heard > (self._limit or 1e30)]
+        if silent:
+            named = ", ".join(f"{index} (process {self._workers[index].pid})" for index in silent)
+            raise WorkerError(
+                f"worker {named} of the collector has sent nothing for {self._limit:g} s (collector.timeout)"
+            )
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._results, name)
+
+
+def _dead(workers: Sequence[Any]) -> str | None:
+    """Words on the first worker that has ended."""
+    for index, worker in enumerate(workers):
+        with suppress(ValueError):  # TorchRL has closed those that it ended itself
+            if worker.exitcode is not None:
+                return _end_of(worker.pid, worker.exitcode, index)
+    return None
+
+
+def _end_of(pid: int | None, code: int, index: int | None = None) -> str:
+    name = "a worker of the collector" if index is None else f"worker {index} of the collector"
+    if code < 0:
+        try:
+            how = f"was ended by {signal.Signals(-code).name}"
+        except ValueError:
+            how = f"was ended by signal {-code}"
+        return f"{name} (process {pid}) {how}" + (" (out of memory?)" if code == -signal.SIGKILL else "")
+    return f"{name} (process {pid}) ended with exit code {code}"
