@@ -22,7 +22,7 @@ LINES = [
 
 
 def test_there_are_some():
-    assert len(LINES) >= 3
+    assert len(LINES) >= 2
 
 
 @pytest.mark.parametrize("line", LINES)
