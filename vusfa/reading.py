@@ -10,7 +10,7 @@ import os
 import zipfile
 import zlib
 from array import array
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Mapping
 from typing import Any, BinaryIO
 
 import numpy as np
@@ -22,6 +22,7 @@ from vusfa.limits import brief
 
 __all__ = [
     "BoundedZip",
+    "check_fields",
     "parse_yaml",
     "read_csv",
     "read_json",
@@ -134,6 +135,27 @@ def read_json(path: str | os.PathLike[str], error: type[VusfaError], mend: str) 
     if not isinstance(content, dict):
         raise error(f"{path}: holds {brief(content)} in place of an object; {mend}")
     return content
+
+
+def check_fields(
+    content: Mapping[str, Any],
+    kinds: Mapping[str, type | tuple[type, ...]],
+    path: str | os.PathLike[str],
+    error: type[VusfaError],
+    mend: str,
+) -> None:
+    """Refuse fields of a file, where it has them, that are of another type than code reads them as.
+
+    >>> from vusfa.errors import ConfigError
+    >>> check_fields({"seed": "one"}, {"seed": int}, "config.json", ConfigError, "write it again")
+    Traceback (most recent call last):
+    ...
+    vusfa.errors.ConfigError: config.json: field 'seed' is 'one'; write it again
+    """
+    for name, kind in kinds.items():
+        value = content.get(name)
+        if name in content and (not isinstance(value, kind) or (kind is int and isinstance(value, bool))):
+            raise error(f"{path}: field {name!r} is {brief(value)}; {mend}")
 
 
 def read_csv(

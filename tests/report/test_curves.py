@@ -10,14 +10,15 @@ from vusfa.report.curves import band, learning_curves
 from vusfa.report.runs import LoggedRun
 
 
-def test_a_curve_counts_between_its_ends_only():
+def test_a_band_goes_as_far_as_all_of_its_curves():
     short = (np.array([10.0, 20.0]), np.array([1.0, 3.0]))
     long = (np.array([0.0, 20.0, 40.0]), np.array([0.0, 2.0, np.nan]))
     found = band([short, long, (np.array([15.0]), np.array([np.nan]))])
-    assert found["x"] == [0, 10, 20]
-    assert found["mean"] == [0, 1, 2.5]
-    assert found["low"] == [0, 1, 2]
-    assert found["high"] == [0, 1, 3]
+    assert found["x"] == [10, 20]
+    assert found["mean"] == [1, 2.5]
+    assert found["low"] == [1, 2]
+    assert found["high"] == [1, 3]
+    assert band([(np.array([0.0, 5.0]), np.ones(2)), (np.array([6.0, 9.0]), np.ones(2))])["x"] == []
 
 
 def test_long_logs_are_thinned():

@@ -57,6 +57,8 @@ class Episodes:
         shapes = {name: tuple(getattr(self, name).shape) for name in self.columns}
         if len(set(shapes.values())) != 1 or self.scene.ndim != 1:
             raise ValueError(f"the columns of a table of episodes must all be (n,); they are {shapes}")
+        if len(self) and not 0 <= int(self.scene.min()) <= int(self.scene.max()) < len(self.scene_names):
+            raise ValueError(f"an episode's scene is none of the {len(self.scene_names)} scenes named")
 
     @property
     def columns(self) -> tuple[str, ...]:

@@ -30,12 +30,26 @@ from vusfa.evaluation.exact import ExactGoals
 from vusfa.evaluation.long_table import episode_rows, exact_rows, join_tables, row_label
 from vusfa.files import write_json
 from vusfa.limits import brief
-from vusfa.reading import read_json, read_npz
+from vusfa.reading import check_fields, read_json, read_npz
 
 __all__ = ["Run", "read_run", "read_runs", "write_run"]
 
 _EXACT = "exact"
 _AGAIN = "delete the folder and run it again"
+_FIELDS = {"info": dict, "episodes": list, "scenes": list, "max_steps": int}
+#: What is read of ``info``, where it is there.
+_FACTS: dict[str, Any] = {
+    "model": str,
+    "row": (str, type(None)),
+    "architecture": (str, type(None)),
+    "agent_preset": (str, type(None)),  # the architecture, in results of version 0.1
+    "seed": (int, type(None)),
+    "scenes": list,
+    "scenes_fingerprint": str,
+    "overrides": list,
+    "checkpoint": str,
+    "curves": list,
+}
 _EPISODES = ("scene", "goal", "start", "success", "length", "shortest", "collisions", "trained")
 
 
@@ -137,21 +151,22 @@ def read_run(root: str | Path, experiment: str, name: str) -> Run:
     path = folder / "cell.json"
     content = read_json(path, ResultError, _AGAIN)
     content = {"episodes": [], "scenes": [], "max_steps": 0, **content}
-    for key, kind in {"info": dict, "episodes": list, "scenes": list, "max_steps": int}.items():
-        if not isinstance(content.get(key), kind):
-            raise ResultError(f"{path}: {key!r} is {brief(content.get(key))}; {_AGAIN}")
-    info, modes, steps = content["info"], content["episodes"], content["max_steps"]
-    for mode in modes:
+    check_fields(content, _FIELDS, path, ResultError, _AGAIN)
+    check_fields(content.get("info", {}), _FACTS, path, ResultError, _AGAIN)
+    if "info" not in content:
+        raise ResultError(f"{path}: field 'info' is missing; {_AGAIN}")
+    episodes = {}
+    for mode in content["episodes"]:
         _check_mode(mode, path)
-    episodes = {
-        mode: Episodes(
-            **_read_columns(folder / f"{mode}.npz", _EPISODES),
-            scene_names=tuple(content["scenes"]),
-            max_steps=steps,
-        )
-        for mode in modes
-    }
-    return Run(experiment, name, info, episodes, _read_exact(folder / f"{_EXACT}.npz"))
+        file = folder / f"{mode}.npz"
+        columns = _read_columns(file, _EPISODES)
+        try:
+            episodes[mode] = Episodes(
+                **columns, scene_names=tuple(content["scenes"]), max_steps=content["max_steps"]
+            )
+        except (TypeError, ValueError) as error:
+            raise ResultError(f"{file}: {error}; {_AGAIN}") from error
+    return Run(experiment, name, content["info"], episodes, _read_exact(folder / f"{_EXACT}.npz"))
 
 
 def _read_exact(path: Path) -> ExactGoals | None:

@@ -43,6 +43,6 @@ def write_report(
     states = sum(scene["states"] for scene in content["scenes"].values())
     room = max(0, int(most - weight) - 16 * states - 1000)
     shown = content["agents"] or content["maps"]  # nothing else shows pictures
-    add_pictures(content, open_scenes(runs), room if shown else 0)
+    add_pictures(content, open_scenes(runs, options.scenes), room if shown else 0)
     page = write_page(out, content)
     return [page, *write_tables(out.with_name(f"{out.stem}_tables"), tables)], tables

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -20,8 +21,8 @@ def read_source(source: str | Path, mode: str = "sampled", runs: str | Path = "r
     """Reads whatever a report may be given.
 
     Args:
-        source: folder of a run of recipes/train.py, of one run of results, or of an experiment, all of whose
-            runs are read; ``NAME=FOLDER`` calls the model NAME.
+        source: folder of a run of vusfa train, of one run of results, or of a sweep or an experiment, all of
+            whose runs are read; ``NAME=FOLDER`` calls the model NAME. A sweep's ``multirun.yaml`` is no run.
         mode: of evaluation, ``sampled`` or ``greedy``.
         runs: where the trainings keep logs and checkpoints, ``RUNS/EXPERIMENT/RUN``.
 
@@ -35,17 +36,22 @@ def read_source(source: str | Path, mode: str = "sampled", runs: str | Path = "r
     vusfa.errors.ConfigError: /no/such/folder is not a folder; give the folder of a run or of results
     """
     label, folder = split_name(source)
+    if folder.name == "multirun.yaml" and folder.is_file():
+        return []
     if not folder.is_dir():
         raise ConfigError(f"{folder} is not a folder; give the folder of a run or of results")
     if (folder / "cell.json").is_file():
         return [result_run(folder, label, mode, runs)]
     if (folder / "config.json").is_file():
         return [read_run(source)]
+    sweep = sorted(path.parent for path in folder.glob("*/config.json") if path.parent.name[0] != ".")
     folders = sorted(path.parent for path in folder.glob("*/cell.json") if path.parent.name[0] != ".")
+    if sweep and not folders:
+        return [replace(run, label=label or run.label) for run in map(read_run, sweep)]
     if not folders:
         raise ConfigError(
             f"{folder} holds neither a run (config.json) nor results (cell.json); give the folder of a run of"
-            " recipes/train.py, or of results"
+            " vusfa train, or of results"
         )
     return sorted((result_run(path, label, mode, runs) for path in folders), key=_order)
 
@@ -74,6 +80,7 @@ def result_run(folder: Path, label: str = "", mode: str = "sampled", runs: str |
     log, checkpoint = kept / "metrics.csv", kept / str(info.get("checkpoint", "checkpoint.pt"))
     scenes = info.get("scenes", episodes.scene_names if episodes else ())
     settings: dict[str, Any] = {"agent": {"model": info.get("model", run.name)}, "scenes": list(scenes)}
+    settings["overrides"] = [text for text in info.get("overrides", ()) if not str(text).startswith("seed=")]
     if (kept / "config.json").is_file():  # it names scenes' files, too
         settings = dict(read_run(kept).settings)
     return LoggedRun(
@@ -88,6 +95,7 @@ def result_run(folder: Path, label: str = "", mode: str = "sampled", runs: str |
         mode,
         run.exact if mode == "sampled" else None,
         {"frames": _number(info, "frames"), "seconds": _number(info, "training_s")},
+        info.get("scenes_fingerprint", ""),
     )
 
 

@@ -14,6 +14,8 @@ from vusfa.report.build import write_report
 from vusfa.report.cells import read_source
 from vusfa.report.content import Options
 from vusfa.report.page import even
+from vusfa.report.runs import split_name
+from vusfa.scenes import SceneSet
 from vusfa.training import set_threads
 from vusfa.training.loggers import make_loggers
 
@@ -31,6 +33,7 @@ def report_runs(
     max_steps: int = MAX_STEPS,
     mode: Literal["sampled", "greedy"] = "sampled",
     runs: Path = Path("runs"),
+    scenes: list[str] | None = None,
     megabytes: float = 40.0,
     wandb: Literal["online", "offline"] | None = None,
     project: str = "vusfa",
@@ -42,7 +45,7 @@ def report_runs(
     NAME; runs of one name are seeds of one thing.
 
     Args:
-        sources: folders of runs of vusfa train, of results, or of experiments.
+        sources: folders of runs of vusfa train, of results, of sweeps or of experiments.
         out: the page.
         title: of the page.
         goals_per_scene: goals of each scene in the explorer, at most.
@@ -51,6 +54,7 @@ def report_runs(
         max_steps: actions allowed in these walks.
         mode: of the evaluations that results hold.
         runs: where the trainings of results keep logs and checkpoints, as RUNS/EXPERIMENT/CELL.
+        scenes: bundled names and files, where they have moved since the training.
         megabytes: what the page may weigh; goals, then pictures are left out to keep it.
         wandb: send the tables to W&B, too; offline leaves them beside the page.
         project: of W&B.
@@ -65,7 +69,8 @@ def report_runs(
         walks=walks,
         max_steps=max_steps,
         megabytes=megabytes,
-        command=shlex.join(["vusfa", "report", *sources, "--out", str(out)]),
+        command=shlex.join(["vusfa", "report", *map(_shown, sources), "--out", _shown(str(out))]),
+        scenes=None if scenes is None else SceneSet.open(scenes),
         tell=lambda line: print(line, file=sys.stderr),
     )
     read = [run for source in sources for run in read_source(source, mode, runs)]
@@ -80,3 +85,12 @@ def report_runs(
                     loggers.log_table(name, even(rows), 0)
     for path in paths:
         print(path)
+
+
+def _shown(source: str) -> str:
+    """A path as a page may tell it: relative to the present folder, or its last part alone."""
+    name, path = split_name(source)
+    absolute = path.absolute()
+    inside = absolute.is_relative_to(Path.cwd())
+    shown = absolute.relative_to(Path.cwd()) if inside else Path("...", absolute.name)
+    return f"{name}={shown}" if name else str(shown)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import platform
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import lru_cache
 from typing import Any
 
 import torch
@@ -12,19 +13,21 @@ import torch
 import vusfa
 from vusfa.envs.dynamics import MAX_STEPS
 from vusfa.errors import ConfigError
-from vusfa.evaluation import get_metric, random_walk
+from vusfa.evaluation import Episodes, get_metric, random_walk
 from vusfa.evaluation.baselines import RANDOM_WALK
 from vusfa.evaluation.summary import metric_columns
 from vusfa.report.by_goal import distance_rows, goal_rows
 from vusfa.report.curves import learning_curves
 from vusfa.report.explorer import choose_goals, choose_starts, sampled_walks, state_maps
 from vusfa.report.geometry import floor_plan
+from vusfa.report.grouping import separate_runs
 from vusfa.report.packing import pack
 from vusfa.report.pictures import thumbnails
 from vusfa.report.runs import LoggedRun
 from vusfa.report.tables import reference_rows, run_rows, seed_rows, summary_rows
 from vusfa.scenes import Scene, SceneSet
 from vusfa.training import load_agent
+from vusfa.training.checkpoint import check_scenes, load_checkpoint
 
 __all__ = ["Options", "add_pictures", "gather", "goal_limit", "open_scenes", "tables"]
 
@@ -47,6 +50,7 @@ class Options:
         max_steps: actions allowed in these walks.
         megabytes: what the page may weigh.
         command: that made it, for whoever makes it again.
+        scenes: where the runs' scenes are now, see :func:`open_scenes`.
         tell: called with a line on what is being done.
     """
 
@@ -58,26 +62,82 @@ class Options:
     max_steps: int = MAX_STEPS
     megabytes: float = 40.0
     command: str = ""
+    scenes: SceneSet | None = None
     tell: Callable[[str], None] = field(default=lambda line: None)
 
 
-def open_scenes(runs: Sequence[LoggedRun]) -> dict[str, Scene]:
-    """The scenes of all runs, by name.
+def open_scenes(runs: Sequence[LoggedRun], given: SceneSet | None = None) -> dict[str, Scene]:
+    """The scenes of all runs, by name, each the very one that its run was trained in.
+
+    Args:
+        runs: what to report.
+        given: where the runs' scenes are now; found as the checkpoints and settings say by default.
 
     Raises:
-        ConfigError: two runs have different scenes of one name.
+        ConfigError: two runs have different scenes of one name, or a run has episodes of another scene.
+        CheckpointError: a scene is another one than that of the training.
         SceneError: a scene is not where it was.
     """
     found: dict[str, tuple[Scene, LoggedRun]] = {}
+    opened = lru_cache(SceneSet.open)
     for run in runs:
-        for scene in SceneSet.open(run.scenes).scenes if run.scenes else ():
+        world = _world(run, given, lambda sources: opened(tuple(sources)))
+        for scene in world.scenes if world else ():
             known, first = found.setdefault(scene.name, (scene, run))
-            if not torch.equal(known.graph, scene.graph):
+            if known is not scene and not _equal(known, scene):
                 raise ConfigError(
                     f"{first.folder} and {run.folder} have different scenes called {scene.name!r};"
                     " report them apart, or rename one (attribute 'scene')"
                 )
+        _check_episodes(run, world)
     return {name: scene for name, (scene, _) in found.items()}
+
+
+def _world(
+    run: LoggedRun, given: SceneSet | None, opened: Callable[[Sequence[str]], SceneSet]
+) -> SceneSet | None:
+    saved: dict[str, Any] = {"sources": run.scenes, "fingerprint": run.fingerprint}
+    if run.checkpoint is not None:
+        saved = load_checkpoint(run.checkpoint)["scenes"]
+    if given is not None:
+        every = given.names if run.episodes is None else run.episodes.scene_names
+        names = saved.get("names", every)
+        missing = [name for name in names if name not in given.names]
+        if missing:
+            raise ConfigError(f"scenes: {run.folder} is of {missing[0]!r}, which is not among them; add it")
+        world = SceneSet([given.scenes[given.scene_index(name)] for name in names])
+    elif saved["sources"]:
+        world = opened(saved["sources"])
+    else:
+        return None
+    if saved["fingerprint"]:
+        check_scenes(run.folder, {"names": list(world.names), **saved}, world)
+    return world
+
+
+def _walked_in(part: Episodes, scene: Scene) -> bool:
+    ids = torch.stack([part.start, part.goal])
+    if int(ids.min()) < 0 or int(ids.max()) >= scene.num_states:
+        return False
+    return bool((scene.distance[part.start, part.goal] == part.shortest).all())
+
+
+def _equal(one: Scene, other: Scene) -> bool:
+    return torch.equal(one.graph, other.graph) and torch.equal(one.features, other.features)
+
+
+def _check_episodes(run: LoggedRun, world: SceneSet | None) -> None:
+    """Refuse episodes of other scenes than the run's: their shortest paths tell."""
+    if run.episodes is None or world is None:
+        return
+    for index, name in enumerate(run.episodes.scene_names):
+        part = run.episodes.select(run.episodes.scene == index)
+        scene = world.scenes[world.names.index(name)] if name in world.names else None
+        if scene is None or not _walked_in(part, scene):
+            raise ConfigError(
+                f"{run.folder}: its episodes in {name!r} are of another scene than the run's"
+                f" ({', '.join(world.names)}); evaluate the run again with vusfa evaluate"
+            )
 
 
 def tables(runs: Sequence[LoggedRun], scenes: Mapping[str, Scene], options: Options) -> dict[str, list[Row]]:
@@ -131,9 +191,11 @@ def gather(
     """
     options = options or Options()
     if not runs:
-        raise ConfigError("a report needs at least one run; give the folders of runs of recipes/train.py")
-    scenes = open_scenes(runs)
-    options.tell("tables")
+        raise ConfigError("a report needs at least one run; give the folders of runs of vusfa train")
+    scenes = open_scenes(runs, options.scenes)
+    runs, notes = separate_runs(runs)
+    for line in [*notes, "tables"]:
+        options.tell(line)
     rows = tables(runs, scenes, options)
     labels = list(dict.fromkeys(run.label for run in runs))
     shown = [
@@ -149,6 +211,7 @@ def gather(
     content: dict[str, Any] = {
         "title": options.title,
         "command": options.command,
+        "notes": notes,
         "versions": {
             "vusfa": vusfa.__version__,
             "torch": torch.__version__,
@@ -254,7 +317,7 @@ def _is_share(name: str) -> bool:
 
 def _explored(run: LoggedRun, goals: Mapping[str, Sequence[int]], options: Options) -> Row:
     assert run.checkpoint is not None
-    agent, scenes, state = load_agent(run.checkpoint)
+    agent, scenes, state = load_agent(run.checkpoint, _world(run, options.scenes, SceneSet.open))
     config, found = agent.config, {}
     for index, scene in enumerate(scenes.scenes):
         chosen = goals[scene.name]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -49,8 +48,8 @@ def band(
 ) -> dict[str, list[float | None]]:
     """Mean, smallest and largest of several curves, on common frames.
 
-    Each curve is joined by straight lines between its own points, and counts from its first to its last one
-    only.
+    Each curve is joined by straight lines between its own points. The band goes as far as all of them do, so
+    that it does not jump where one ends.
 
     Args:
         curves: pairs of frames (n,), rising, and values (n,); a NaN value is left out.
@@ -68,13 +67,15 @@ def band(
     known = [(x, y) for x, y in known if len(x)]
     if not known:
         return {"x": [], "mean": [], "low": [], "high": []}
+    first, last = max(x[0] for x, _ in known), min(x[-1] for x, _ in known)
     grid = np.unique(np.concatenate([x for x, _ in known]))
+    grid = grid[(grid >= first) & (grid <= last)]
     if len(grid) > points:
         grid = grid[np.unique(np.linspace(0, len(grid) - 1, points).round().astype(int))]
-    values = np.stack([np.interp(grid, x, y, left=np.nan, right=np.nan) for x, y in known])
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", RuntimeWarning)  # of frames where all are NaN
-        parts = {"mean": np.nanmean(values, 0), "low": np.nanmin(values, 0), "high": np.nanmax(values, 0)}
+    if not len(grid):
+        return {"x": [], "mean": [], "low": [], "high": []}
+    values = np.stack([np.interp(grid, x, y) for x, y in known])
+    parts = {"mean": values.mean(0), "low": values.min(0), "high": values.max(0)}
     return {"x": grid.tolist(), **{name: _plain(part) for name, part in parts.items()}}
 
 

@@ -115,7 +115,13 @@ def read_experiment(root: str | Path, names: Sequence[str], scenes: SceneSet | N
         )
     groups: dict[str, list[Run]] = {}
     for run in sorted(runs, key=_order):
-        groups.setdefault(run.label, []).append(run)
+        group = groups.setdefault(run.label, [])
+        if group and group[-1].seed == run.seed:
+            one, two = (f"{found.experiment}/{found.name}" for found in (group[-1], run))
+            raise ResultError(
+                f"{root}: {one} and {two} are both seed {run.seed} of {run.label}; show them apart"
+            )
+        group.append(run)
     shortest = episode_rows(shortest_paths(first), SHORTEST_PATH, mode="exact")
     goals = shortest[["scene", "goal", "trained"]].drop_duplicates()
     walk = exact_rows(_random_walk(scenes), goals, scenes.names, RANDOM_WALK)
@@ -134,6 +140,6 @@ def _random_walk(scenes: SceneSet) -> ExactGoals:
 
 
 def _order(run: Run) -> tuple[int, str, int]:
-    model = str(run.info["model"])
+    model = str(run.info.get("model", ""))
     rank = _FIRST.index(model) if model in _FIRST else len(_FIRST)
     return (rank if run.label == model else len(_FIRST) + 1, run.label, run.seed)

@@ -13,21 +13,34 @@ import pandas as pd
 import torch
 
 from vusfa.envs.dynamics import MAX_STEPS
-from vusfa.errors import ConfigError
+from vusfa.errors import CheckpointError, ConfigError
 from vusfa.evaluation import Episodes
 from vusfa.evaluation.exact import ExactGoals
 from vusfa.evaluation.long_table import WITHIN, episode_rows, exact_rows, join_tables, row_label
-from vusfa.reading import read_csv, read_json
+from vusfa.limits import brief
+from vusfa.reading import check_fields, read_csv, read_json
 from vusfa.report.curve import read_metrics
 from vusfa.training import row_name
 
 __all__ = ["LoggedRun", "read_episodes", "read_run", "run_label", "split_name"]
 
 _EVALUATIONS = ("zero_shot", "evaluation")
-_A_RUN = "give the folder of a run of recipes/train.py"
 _AGAIN = "evaluate the run again with recipes/zero_shot.py"
-# What JSON of another content than ours ends in.
-_OTHER_CONTENT = (AttributeError, KeyError, OverflowError, TypeError, ValueError)
+#: Types of what a report reads of a run's settings, where they are there.
+_SETTINGS: dict[str, Any] = {
+    "agent": dict,
+    "env": dict,
+    "scenes": (str, list),
+    "seed": (int, type(None)),
+    "device": str,
+    "total_frames": int,
+}
+_AGENT: dict[str, Any] = {
+    "model": str,
+    "architecture": (str, type(None)),
+    "preset": (str, type(None)),  # the architecture, in version 0.1
+    "history": (int, type(None)),
+}
 _COLUMNS = ("goal", "start", "success", "length", "shortest", "collisions", "trained")
 
 
@@ -45,8 +58,9 @@ class LoggedRun:
         references: the evaluation's rows of other policies (random walk, shortest path, ...).
         checkpoint: path of its weights, or None.
         variant: how actions were taken in the evaluation: "sampled" or "greedy".
-        exact: its goals' exact chances, or None.
+        exact: its goals' exact probabilities, or None.
         facts: frames and seconds of the training, where there is no log.
+        fingerprint: of the scenes it was trained in, where its folder tells; its checkpoint's comes first.
     """
 
     label: str
@@ -60,6 +74,7 @@ class LoggedRun:
     variant: str = "sampled"
     exact: ExactGoals | None = None
     facts: Mapping[str, float] = field(default_factory=dict)
+    fingerprint: str = ""
 
     def rows(self, within: Sequence[int] = WITHIN) -> pd.DataFrame:
         """Its evaluation as a long table, see :mod:`vusfa.evaluation.long_table`.
@@ -120,20 +135,12 @@ def read_run(source: str | Path) -> LoggedRun:
     label, folder = split_name(source)
     if not folder.is_dir():
         raise ConfigError(f"{folder} is not a folder; give the folder of a run of recipes/train.py")
-    settings = read_json(folder / "config.json", ConfigError, _A_RUN)
-    if not isinstance(settings.get("agent"), Mapping) or "model" not in settings["agent"]:
-        raise ConfigError(
-            f"{folder / 'config.json'}: field 'agent.model' is missing; it is no run's settings"
-        )
-    try:
-        label, seed = label or run_label(settings), int(settings.get("seed", 0))
-    except _OTHER_CONTENT as error:
-        raise ConfigError(f"{folder / 'config.json'}: is no run's settings ({error!r}); {_A_RUN}") from error
+    settings, named = _read_settings(folder / "config.json")
     log, checkpoint = folder / "metrics.csv", folder / "checkpoint.pt"
     episodes, references, variant = _evaluation(folder)
     return LoggedRun(
-        label,
-        seed,
+        label or named,
+        int(settings.get("seed") or 0),
         folder,
         settings,
         read_metrics(log) if log.is_file() else {},
@@ -142,6 +149,25 @@ def read_run(source: str | Path) -> LoggedRun:
         checkpoint if checkpoint.is_file() else None,
         variant,
     )
+
+
+def _read_settings(path: Path) -> tuple[dict[str, Any], str]:
+    """A run's settings, checked as far as a report reads them, and its label."""
+    mend = "give the folder of a run of vusfa train"
+    settings = read_json(path, ConfigError, mend)
+    check_fields(settings, _SETTINGS, path, ConfigError, mend)
+    agent = settings.get("agent", {})
+    if "model" not in agent:
+        raise ConfigError(f"{path}: field 'agent.model' is missing; it is no run's settings")
+    check_fields(agent, _AGENT, f"{path}, agent", ConfigError, mend)
+    if not all(isinstance(scene, str) for scene in settings.get("scenes", ())):
+        raise ConfigError(f"{path}: field 'scenes' is {brief(settings['scenes'])}; {mend}")
+    try:
+        return settings, run_label(settings)
+    except CheckpointError as error:
+        raise ConfigError(f"{path}: {error}") from error
+    except (AttributeError, KeyError, TypeError, ValueError) as error:
+        raise ConfigError(f"{path}: these are no settings of vusfa train ({error!r}); {mend}") from error
 
 
 def run_label(settings: Mapping[str, Any]) -> str:
@@ -206,20 +232,29 @@ def _evaluation(folder: Path) -> tuple[Episodes | None, list[dict[str, Any]], st
         if not table.is_file() or not summary.is_file():
             continue
         content = read_json(summary, ConfigError, _AGAIN)
-        try:
-            settings, rows = content.get("settings", {}), content.get("rows", [])
-            max_steps = int(settings.get("max_steps", MAX_STEPS))
-            own = rows[0]["policy"] if rows else ""
-            others = [_with_nan(row) for row in rows if row["policy"] != own]
-            variant = "sampled" if settings.get("sample", True) else "greedy"
-        except _OTHER_CONTENT as error:
-            raise ConfigError(f"{summary}: is no evaluation ({error!r}); {_AGAIN}") from error
-        episodes = read_episodes(table, max_steps)
+        check_fields(content, {"settings": dict, "rows": list}, summary, ConfigError, _AGAIN)
+        settings, rows = content.get("settings", {}), content.get("rows", [])
+        check_fields(settings, {"max_steps": int, "sample": bool}, summary, ConfigError, _AGAIN)
+        if not all(_is_summary(row) for row in rows):
+            raise ConfigError(f"{summary}: a row of 'rows' is no row of a summary; {_AGAIN}")
+        episodes = read_episodes(table, settings.get("max_steps", MAX_STEPS))
+        own = rows[0]["policy"] if rows else ""
+        others = [_with_nan(row) for row in rows if row["policy"] != own]
+        variant = "sampled" if settings.get("sample", True) else "greedy"
         num_goals = int(torch.stack([episodes.scene, episodes.goal]).unique(dim=1).shape[1])
         found.append((num_goals, episodes, others, variant))
     if not found:
         return None, [], "sampled"
     return max(found, key=lambda item: item[0])[1:]
+
+
+def _is_summary(row: Any) -> bool:
+    words = ("policy", "goals", "scene")
+    return (
+        isinstance(row, Mapping)
+        and all(isinstance(row.get(name), str) for name in words)
+        and all(isinstance(v, int | float | None) for name, v in row.items() if name not in words)
+    )
 
 
 def _with_nan(row: Mapping[str, Any]) -> dict[str, Any]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import pandas as pd
@@ -149,8 +150,8 @@ def run_rows(runs: Sequence[LoggedRun]) -> list[Row]:
                 "frames": run.frames,
                 "minutes": run.seconds / 60,
                 "device": run.settings.get("device", ""),
-                "scenes": ", ".join(run.scenes),
-                "goals": str(run.settings.get("env", {}).get("goals", "")),
+                "scenes": ", ".join(Path(scene).stem for scene in run.scenes),
+                "goals": _goals(run),
                 "history": run.settings.get("agent", {}).get("history", math.nan),
                 "trained_success": _success(episodes, True),
                 "unseen_success": _success(episodes, False),
@@ -158,6 +159,12 @@ def run_rows(runs: Sequence[LoggedRun]) -> list[Row]:
             }
         )
     return rows
+
+
+def _goals(run: LoggedRun) -> str:
+    """What was given as goals: ids, a rule, or a manifest, which is told by its name."""
+    goals = run.settings.get("env", {}).get("goals", "")
+    return Path(goals).name if isinstance(goals, str) else str(goals)
 
 
 def _success(episodes: Episodes | None, trained: bool) -> float:

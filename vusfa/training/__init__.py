@@ -11,7 +11,6 @@ from vusfa.training.checkpoint import (
     load_checkpoint,
     rebuild_agent,
     save_checkpoint,
-    scene_sources,
 )
 from vusfa.training.collectors import check_goals_dealt, make_collector, make_env
 from vusfa.training.facts import machine_facts, run_facts
@@ -21,6 +20,7 @@ from vusfa.training.metrics import EpisodeMeter, MeanMeter
 from vusfa.training.optimization import descend, make_optimizer, total_loss
 from vusfa.training.progress import EvaluationProgress, ProgressLine
 from vusfa.training.run import run_training
+from vusfa.training.scene_files import scene_sources
 from vusfa.training.setup import make_observation, make_trainer, row_name, set_threads, torch_device
 from vusfa.training.signals import StopOnSignal
 from vusfa.training.trainer import Trainer

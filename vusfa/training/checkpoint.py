@@ -12,7 +12,7 @@ says what differs before anything is restored. Files of version 0.1 are converte
 ``seconds``                time spent
 ``agent_config``           what :func:`vusfa.modules.make_agent` needs besides the scenes
 ``agent``                  the agent's ``state_dict``
-``scenes``                 what was given as scenes, their names, and the set's fingerprint
+``scenes``                 where they are, seen from here, their names, and the set's fingerprint
 ``goals``                  (G,) global ids of the goals trained on
 ``config``                 all settings, resolved: those that a resumed run continues with
 ``overrides``              the command line that made them, to be read; it is never run
@@ -30,7 +30,7 @@ from __future__ import annotations
 import copy
 import os
 import reprlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -38,11 +38,12 @@ import torch
 from torch import Tensor
 
 from vusfa.conf.settings import flat
-from vusfa.errors import CheckpointError, VusfaError
+from vusfa.errors import CheckpointError, SceneError, VusfaError
 from vusfa.files import replacing
 from vusfa.modules import Agent, make_agent
-from vusfa.scenes import SceneSet, bundled_names
+from vusfa.scenes import SceneSet
 from vusfa.training.content import check_entries, check_like, mended, read_content
+from vusfa.training.scene_files import find_source
 from vusfa.training.upgrade import upgrade
 
 __all__ = [
@@ -57,7 +58,6 @@ __all__ = [
     "load_weights",
     "rebuild_agent",
     "save_checkpoint",
-    "scene_sources",
 ]
 
 FORMAT = 2
@@ -120,6 +120,7 @@ def load_checkpoint(path: str | Path, device: torch.device | str = "cpu") -> dic
             f" {FORMAT}; use the version that wrote it"
         )
     check_entries(path, state)
+    state["scenes"]["sources"] = [find_source(source, path) for source in state["scenes"]["sources"]]
     return state
 
 
@@ -182,16 +183,6 @@ def differences(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
     return [f"{key}={new.get(key)} instead of {old.get(key)}" for key in sorted(keys) if key not in _REWORDED]
 
 
-def scene_sources(scenes: str | Sequence[str]) -> list[str]:
-    """Names and paths of scenes, paths made absolute.
-
-    >>> scene_sources("kitchen")
-    ['kitchen']
-    """
-    given = [scenes] if isinstance(scenes, str) else list(scenes)
-    return [name if name in bundled_names() else str(Path(name).resolve()) for name in given]
-
-
 def rebuild_agent(config: Mapping[str, Any], scenes: SceneSet) -> Agent:
     """An untrained agent of the shape that :attr:`vusfa.modules.Agent.config` describes.
 
@@ -222,7 +213,14 @@ def load_agent(
     """
     device = torch.device(device)
     state = load_checkpoint(path, device)
-    scenes = (SceneSet.open(state["scenes"]["sources"]) if scenes is None else scenes).to(device)
+    if scenes is None:
+        try:
+            scenes = SceneSet.open(state["scenes"]["sources"])
+        except SceneError as error:
+            raise SceneError(
+                f"{error}; if the scenes of {path} have moved, put them beside it or give them as scenes"
+            ) from error
+    scenes = scenes.to(device)
     check_scenes(path, state["scenes"], scenes)
     try:
         agent = rebuild_agent(state["agent_config"], scenes).to(device)

@@ -32,7 +32,6 @@ from vusfa.training.checkpoint import (
     load_optimizer,
     load_weights,
     save_checkpoint,
-    scene_sources,
 )
 from vusfa.training.collectors import collector_state, load_collector_state, opened
 from vusfa.training.content import check_like, restore
@@ -40,6 +39,7 @@ from vusfa.training.metrics import EpisodeMeter, MeanMeter
 from vusfa.training.optimization import descend, total_loss
 from vusfa.training.precision import resolve_autocast
 from vusfa.training.random_state import check_random_state, random_state, restore_random_state
+from vusfa.training.scene_files import scene_sources
 from vusfa.training.workers import supervised
 
 __all__ = ["Trainer"]
@@ -200,7 +200,7 @@ class Trainer:
                 "seconds": self.seconds,
                 "run_id": self.run_id,
                 "scenes": {
-                    "sources": scene_sources(self.settings["scenes"]),
+                    "sources": scene_sources(self.settings["scenes"], Path(path).parent),
                     "names": list(self.scenes.names),
                     "fingerprint": self.scenes.fingerprint,
                 },

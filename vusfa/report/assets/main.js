@@ -23,7 +23,7 @@ function introduce() {
   said.push(DATA.goals_limit < DATA.goals_asked ? ` (${DATA.goals_asked} were asked for).` : ".");
   const pictures = scenes.reduce((sum, scene) => sum + scene.pictures.ids.length, 0);
   if (pictures && pictures < states) said.push(` It has pictures of ${grouped(pictures)} of the ${grouped(states)} poses.`);
-  said.push(" The tables lie beside this page as CSV, unrounded.");
+  said.push(" The tables lie beside this page as CSV, unrounded.", ...DATA.notes.map((note) => ` ${note}`));
   $("about").textContent = said.join("");
 }
 
