@@ -131,7 +131,7 @@ class TestA2CTrainer:
 class TestPlainTask:
     """A plain loop, as a user would write it."""
 
-    def train(self, loss: USFLoss, frames: int = 5000) -> list[TensorDict]:
+    def train(self, loss: USFLoss, frames: int = 3400) -> list[TensorDict]:
         """What each batch gave: the mean length of its episodes and its losses."""
         loss.make_value_estimator(ValueEstimators.GAE, gamma=0.99, lmbda=0.95, normalize_advantage=True)
         optimiser = torch.optim.Adam(loss.parameters(), 3e-3)
@@ -153,7 +153,7 @@ class TestPlainTask:
                 optimiser.step()
             ended = rollout["next", "done"]
             # a batch in which no episode ends is one of long episodes
-            length = rollout["next", "elapsed_steps"][ended].double().mean().nan_to_num(200.0)
+            length = rollout["next", "step_count"][ended].double().mean().nan_to_num(200.0)
             if "successor_target" in targets:
                 losses["scale"] = targets["successor_target"].square().mean()
             history.append(losses.detach().set("length", length))
