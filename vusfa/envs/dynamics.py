@@ -1,10 +1,9 @@
 """The task as pure functions of tensors: one step of many agents at once.
 
-A scene is a finite graph of photographed poses. An action moves the agent along an edge; where there is none
-the agent stays and the step counts as a collision, which is a step like any other: it costs time, and the
-frame it ends on (the same as before) is pushed into the history. An episode ends at the goal, which is one
-pose, heading included, or when the time is up. (Zhu et al. 2017, https://arxiv.org/abs/1609.05143, section 4;
-the released code of VUSFA.)
+A scene is a finite graph of photographed poses. An action moves the agent along an edge; where there is none,
+the agent stays and collides, which is a step like any other. An episode ends at the goal, which is one pose,
+heading included, or when the time is up. (Zhu et al. 2017, https://arxiv.org/abs/1609.05143, section 4; the
+released code of VUSFA.)
 """
 
 from __future__ import annotations
@@ -41,7 +40,7 @@ GOAL_REWARD, STEP_REWARD = 1.0, -0.01
 
 
 class Rewards(NamedTuple):
-    """Rewards of a step: three scalars as 0-dimensional float32 tensors, so that the type never varies.
+    """Rewards of a step, 0-dimensional float32 tensors.
 
     >>> Rewards.of(goal=10.0, step=-0.01, collision=-0.1).collision
     tensor(-0.1000)
@@ -55,7 +54,7 @@ class Rewards(NamedTuple):
     def of(
         cls, goal: float = GOAL_REWARD, step: float = STEP_REWARD, collision: float | None = None
     ) -> Rewards:
-        """Build it from numbers. Without a ``collision`` reward a collision earns what any step earns."""
+        """From numbers; ``collision=None``: a collision earns what any step earns."""
         as_tensor = [
             None if x is None else torch.tensor(x, dtype=torch.float32) for x in (goal, step, collision)
         ]
@@ -71,7 +70,7 @@ class Transition(NamedTuple):
         collided: (*B, 1) bool, the move was blocked and the agent stayed.
         elapsed_steps: (*B, 1) int64, steps since the episode began, this one included.
         terminated: (*B, 1) bool, the agent is at its goal.
-        truncated: (*B, 1) bool, the time is up (whether or not the goal was reached with the last step).
+        truncated: (*B, 1) bool, the time is up, also when the last step reached the goal.
         done: (*B, 1) bool, either of the two.
     """
 
@@ -85,7 +84,7 @@ class Transition(NamedTuple):
 
 
 def start_history(state: Tensor, history: int) -> Tensor:
-    """History of an episode that has just begun: its first frame, repeated. (*B,) -> (*B, H), its own memory.
+    """History (*B, H) of an episode that begins: its first frame (*B,), repeated.
 
     >>> start_history(torch.tensor([7, 3]), 2)
     tensor([[7, 7],
@@ -104,10 +103,10 @@ def push_frame(state_id: Tensor, state: Tensor) -> Tensor:
 
 
 def check_actions(action: Tensor, num_actions: int) -> Tensor:
-    """Return actions of any integer type and shape as int64.
+    """Actions of any integer type and shape as int64.
 
     Raises:
-        ActionError: they are of another type, or outside 0..A-1. Indexing alone would take -1 for the last.
+        ActionError: another type, or an action outside 0..A-1; indexing would take -1 for the last.
 
     >>> check_actions(torch.tensor([0, -1]), 4)
     Traceback (most recent call last):
@@ -139,7 +138,7 @@ def step(
     elapsed_steps: Tensor,
     action: Tensor,
 ) -> Transition:
-    """Move every agent by one action. Nothing is written in place, nothing is drawn at random.
+    """Move every agent by one action. Nothing is written in place or drawn at random.
 
     Args:
         successor: (S, A) int64, the state each action leads to; a blocked one leads back to the same state.
@@ -151,11 +150,8 @@ def step(
         elapsed_steps: (*B, 1) int64, steps since the episode began.
         action: (*B,) int64 in 0..A-1.
 
-    Returns:
-        The :class:`Transition`.
-
     Raises:
-        ActionError: an action is no whole number in 0..A-1 (an IndexError; not looked at while compiling).
+        ActionError: another action (an IndexError; not checked while compiling).
 
     >>> line = torch.tensor([[1, 0], [2, 0], [2, 1]])  # right, left
     >>> walls = torch.tensor([[False, True], [False, False], [True, False]])

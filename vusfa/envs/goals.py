@@ -39,18 +39,14 @@ PAPER_MANIFEST = Path(__file__).parent / "manifests" / "paper.yaml"
 
 
 def resolve_goals(scenes: SceneSet, goals: GoalSpec) -> Tensor:
-    """Turn any way to name goals into global state ids.
+    """Global state ids of goals, (G,) int64 on the CPU, scene by scene; ids stay in their order.
 
     Args:
         scenes: the world.
         goals: one of the forms in the table above.
 
-    Returns:
-        (G,) int64 on the CPU, G at least 1; scene by scene, except for ids, whose order is kept.
-
     Raises:
-        GoalError: an unknown form, scene or state, or no goal at all. That a goal can be reached is not
-            looked at.
+        GoalError: an unknown form, scene or state, or no goal. Whether goals can be reached is not checked.
 
     >>> rooms = SceneSet.bundled(["bathroom", "kitchen"])
     >>> resolve_goals(rooms, "all").shape, resolve_goals(rooms, "random:3").shape
@@ -108,14 +104,13 @@ def read_manifest(path: str | PathLike[str]) -> dict[str, list[int]]:
 def spread_goals(scene: Scene, count: int) -> list[int]:
     """Choose goals spread over a scene: farthest-point selection on shortest paths. Deterministic.
 
-    The first is the state that is the farthest from all others on average; each further one is the state
-    whose nearest chosen goal is the farthest away. A distance is the mean of there and back, in actions; ties
-    go to the lowest id. Only the largest strongly connected part of the scene is looked at, so that every
-    goal can be reached from every other.
+    The first is the farthest from all others on average; each further one has the farthest nearest chosen
+    goal. A distance is the mean of there and back, in actions; ties go to the lowest id. Goals are of the
+    largest strongly connected part of the scene, so that each can be reached from every other.
 
     Args:
         scene: the scene.
-        count: how many goals, at least 1.
+        count: number of goals, at least 1.
 
     Returns:
         state ids within the scene, ascending.
@@ -163,8 +158,7 @@ def _checked_ids(scenes: SceneSet, goals: Any) -> Tensor:
 
 
 def _as_tensor(goals: Any, source: str) -> Tensor:
-    """Numbers as a tensor on the CPU; words are not truncated to them, and truth values do not count as 0 and
-    1."""
+    """Numbers as a tensor on the CPU; neither words nor truth values."""
     mixed = isinstance(goals, Sequence) and any(isinstance(goal, bool) for goal in goals)
     try:
         if mixed:

@@ -1,7 +1,6 @@
 """Observations for networks that read features or pixels instead of state ids.
 
-The agents of this package read ids and look features up themselves, so that no feature travels through
-collectors, buffers and pipes. :class:`SceneObservation` writes the same numbers into the data.
+The agents of this package look features up by id, so that none travels through collectors, buffers and pipes.
 """
 
 from __future__ import annotations
@@ -24,15 +23,12 @@ __all__ = ["SceneObservation", "observation_table"]
 
 
 def observation_table(scenes: SceneSet, kind: str, size: tuple[int, int] | None = None) -> Tensor:
-    """Table of the observation in every state of a set.
+    """Observations in every state: (S, C, F) float32 features of C crops, or (S, 1, 3, h, w) uint8 pixels.
 
     Args:
         scenes: the world.
         kind: "features" or "pixels".
         size: height and width that pictures are scaled to; None leaves them as they are.
-
-    Returns:
-        (S, C, F) float32 features, C crops of each; or (S, 1, 3, h, w) uint8 pixels.
 
     Raises:
         ConfigError: another kind.
@@ -70,15 +66,13 @@ class SceneObservation(ObservationTransform):
 
     Args:
         scenes: the environment's world.
-        kind: "features" or "pixels". Pictures are read into memory when the first is needed, and do not
-            travel to worker processes, which read their own.
+        kind: "features" or "pixels". Each process reads pictures when the first is needed.
         crop: which of the C augmented views of a state is taken: "first", an index, or "random", which draws
-            one for every frame that is written. The draws come from the environment's own generator where the
-            transform stands in a :class:`TargetNavEnv`, and from torch's global one elsewhere (in a replay
-            buffer, say).
+            one per frame that is written, from the environment's own generator in a :class:`TargetNavEnv`,
+            from torch's global one elsewhere (in a replay buffer, say).
         size: height and width that pictures are scaled to.
-        in_keys: the keys of ids; any number of them.
-        out_keys: the keys to write, one for each.
+        in_keys: keys of ids.
+        out_keys: keys to write, one for each.
 
     Raises:
         ConfigError: another kind, or a crop that does not exist.

@@ -1,7 +1,4 @@
-"""Rendering: an agent's view, its goal, and a map of the scene.
-
-Pillow alone draws them, so that an environment can be watched wherever it runs.
-"""
+"""Rendering with Pillow alone: an agent's view, its goal, and a map of the scene."""
 
 from __future__ import annotations
 
@@ -32,17 +29,13 @@ _Point = tuple[float, float]
 def draw_panels(
     scenes: SceneSet, trail: Sequence[int], goal: int, panels: Sequence[str] | None = None
 ) -> np.ndarray:
-    """Put panels side by side.
+    """Panels side by side, (h, w, 3) uint8.
 
     Args:
         scenes: the world.
-        trail: global ids of the states the agent came through, the last one is where it is.
+        trail: global ids of the states that the agent came through, the last where it is.
         goal: global id.
-        panels: any of "view", "goal" and "map", from left to right; by default the view, or the map where the
-            scene has no pictures.
-
-    Returns:
-        (h, w, 3) uint8.
+        panels: see :meth:`TargetNavEnv.render`.
 
     Raises:
         ConfigError: no panels, or one that does not exist.
@@ -71,16 +64,13 @@ def draw_panels(
 
 
 def draw_map(scene: Scene, trail: Sequence[int], goal: int, size: int = _HEIGHT) -> np.ndarray:
-    """The scene from above, +Z up, with the agent and its goal as arrows that point where they look.
+    """Map of a scene from above, +Z up, with arrows where agent and goal look; (size, size, 3) uint8.
 
     Args:
         scene: the scene; its ``location`` and ``rotation`` are drawn.
-        trail: state ids within the scene that the agent came through, the last one is where it is.
+        trail: state ids within the scene that the agent came through, the last where it is.
         goal: state id within the scene.
-        size: pixels a side.
-
-    Returns:
-        (size, size, 3) uint8.
+        size: pixels per side.
 
     >>> draw_map(Scene.bundled("bathroom"), [0], goal=73, size=64).shape
     (64, 64, 3)
@@ -113,7 +103,7 @@ def draw_map(scene: Scene, trail: Sequence[int], goal: int, size: int = _HEIGHT)
 
 
 def _arrow(center: _Point, heading: float, length: float) -> list[_Point]:
-    """A dart at ``center`` that points to ``heading`` degrees, 0 = up, 90 = right."""
+    """Dart at ``center`` that points to ``heading`` degrees, 0 = up, 90 = right."""
     corners = []
     for turn, reach in ((0.0, 1.0), (140.0, 1.0), (180.0, 0.35), (220.0, 1.0)):
         angle = math.radians(heading + turn)

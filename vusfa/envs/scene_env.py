@@ -42,14 +42,10 @@ def usable_device(device: torch.device | str) -> torch.device:
 class SceneEnv(StatelessEnv):
     """Base of batched environments over scenes. A subclass sets :attr:`_world` and takes the steps.
 
-    Args:
-        scenes: the world.
-        batch_size: any shape.
-        history: frames in ``state_id``.
-        seed: where the environment's own random generator begins; None for somewhere else each time.
+    Arguments are those of :class:`TargetNavEnv`.
 
     Raises:
-        ConfigError: ``scenes`` is no SceneSet, or ``batch_size`` is a number.
+        ConfigError: ``scenes`` is no SceneSet, ``batch_size`` no shape, or ``seed`` no whole number.
     """
 
     batch_locked: ClassVar[bool] = True
@@ -90,8 +86,6 @@ class SceneEnv(StatelessEnv):
         self.reward_spec = specs.reward
         self.full_done_spec = specs.done
 
-    # -- randomness ------------------------------------------------------------------------------------------
-
     def _set_seed(self, seed: int | None) -> None:
         """Start the generator anew; None starts it somewhere else each time."""
         if seed is not None and not (isinstance(seed, int | np.integer) and 0 <= seed < 2**63):
@@ -108,11 +102,11 @@ class SceneEnv(StatelessEnv):
         return self._generator
 
     def get_rng_state(self) -> Tensor:
-        """State of the generator, a byte tensor on the CPU."""
+        """The generator's state, a byte tensor on the CPU."""
         return self._generator.get_state()
 
     def set_rng_state(self, state: Tensor) -> None:
-        """Continue to draw from where :meth:`get_rng_state` was called, on a device of the same kind."""
+        """Draw on from what :meth:`get_rng_state` gave, on a device of the same kind."""
         self._generator.set_state(state.cpu())
 
     def get_extra_state(self) -> Tensor:
@@ -127,20 +121,16 @@ class SceneEnv(StatelessEnv):
         """Restore what :meth:`state_dict` gave; an empty one, as TorchRL's collectors keep, is ignored."""
         return super().load_state_dict(state_dict, strict=strict and bool(state_dict), assign=assign)
 
-    # -- devices ---------------------------------------------------------------------------------------------
-
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> SceneEnv:
-        """Apply a function to all tensors, as every move of a module does; the tables move along."""
+        """Apply a function to all tensors, the tables among them, as every move of a module does."""
         super()._apply(fn, recurse)
         self._world = map_tensors(fn, self._world)
         device = self._world.successor.device
         if device != self._generator.device:
-            # A generator's state means nothing on another kind of device: draws begin again from the seed.
+            # a generator's state means nothing on another kind of device
             self._generator = torch.Generator(device)
             self._set_seed(self._seed)
         return self
-
-    # -- pictures --------------------------------------------------------------------------------------------
 
     def _show(self, state_id: Tensor, goal_id: Tensor, mask: Tensor | None = None) -> None:
         """Remember what :meth:`render` shows by default."""
@@ -159,11 +149,11 @@ class SceneEnv(StatelessEnv):
         """Draw one agent.
 
         Args:
-            tensordict: where the agents are (``state_id`` and ``goal_id``, of the environment's batch size);
-                by default what the environment returned last.
-            row: which agent, its index in the batch (in row-major order when a number).
-            panels: what to show from left to right: "view" what the agent sees, "goal" the goal's picture,
-                "map" the scene from above. By default the view, or the map where a scene has no pictures.
+            tensordict: ``state_id`` and ``goal_id`` of the environment's batch size; by default what the
+                environment returned last.
+            row: index of the agent in the batch (a number: in row-major order).
+            panels: from left to right, any of "view", what the agent sees; "goal", the goal's picture; "map",
+                the scene from above. By default the view, or the map where a scene has no pictures.
 
         Returns:
             (h, w, 3) uint8.

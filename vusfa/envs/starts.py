@@ -1,12 +1,8 @@
 """Distribution of start states: uniform over the states that can reach the goal in more than 0 steps.
 
-The states that can reach a goal are the ancestors of its strongly connected component, so all goals of one
-component share one list, and a room without one-way doors needs a single list for all its goals: memory grows
-with the number of states, not with its square. Drawing a start is then a draw of an index into the list that
-skips the goal itself.
-
-Drawing is pure: random integers go in, states come out. Whoever holds the generator draws the integers, from
-0..2**62-1; taking them modulo a count below 2**24 is uniform to within 1e-11.
+The goals of one strongly connected component share one list of starts, so memory grows with the number of
+states, not with its square. A start is an index into the list that skips the goal itself. Random integers go
+in, states come out; integers from 0..2**62-1 modulo a count below 2**24 are uniform to within 1e-11.
 """
 
 from __future__ import annotations
@@ -75,8 +71,8 @@ def start_table(graphs: Sequence[Tensor], offsets: Tensor, goals: Tensor, names:
     Args:
         graphs: for each scene (N, A) integers, -1 = blocked.
         offsets: (n_scenes + 1,) int64, the global id of each scene's first state.
-        goals: (G,) int64 global ids, G at least 1; a goal may occur several times.
-        names: for each scene its name, for the message.
+        goals: (G,) int64 global ids, G at least 1; repeats are allowed.
+        names: of the scenes, for the message.
 
     Raises:
         GoalError: no other state can reach a goal.
@@ -125,7 +121,7 @@ def start_table(graphs: Sequence[Tensor], offsets: Tensor, goals: Tensor, names:
 
 
 def _component_of_state(graph: Tensor) -> Tensor:
-    """Label of each state's strongly connected component, (N,)."""
+    """Strongly connected component of each state, (N,)."""
     label = torch.empty(len(graph), dtype=torch.int64)
     for index, states in enumerate(strong_components(graph)):
         label[torch.tensor(states)] = index
@@ -133,15 +129,12 @@ def _component_of_state(graph: Tensor) -> Tensor:
 
 
 def draw_starts(members: Tensor, goals: GoalTable, draw: Tensor) -> Tensor:
-    """Turn random integers into starts.
+    """Starts (*B,), global ids, of random integers.
 
     Args:
         members: (M,), of the :class:`StartTable`.
         goals: the goal of each row, columns (*B,).
         draw: (*B,) int64, uniform over 0..DRAW_LIMIT-1.
-
-    Returns:
-        (*B,) int64 global ids, never the goal, always able to reach it.
     """
     index = draw % goals.starts
     index = index + (index >= goals.rank)
@@ -149,29 +142,22 @@ def draw_starts(members: Tensor, goals: GoalTable, draw: Tensor) -> Tensor:
 
 
 def paths_from(distance: Tensor, goals: GoalTable, state: Tensor) -> Tensor:
-    """Actions from states to goals of the same scene, -1 where there is no way.
+    """Shortest paths (*B,) int64 from states to goals of the same scene in actions; -1: there is none.
 
     Args:
         distance: the scenes' flat table, ``SceneSet.distance_tables[0]``.
         goals: the goal of each row, columns (*B,).
         state: (*B,) int64 global ids.
-
-    Returns:
-        (*B,) int64.
     """
     return distance[torch.addcmul(goals.origin, state, goals.stride)].to(torch.int64)
 
 
 def draw_goals(table: StartTable, scene_draw: Tensor, goal_draw: Tensor) -> GoalTable:
-    """Turn random integers into goals: uniform over the scenes that have any, then over the scene's goals.
+    """Goals, columns (*B,): uniform over the scenes that have any, then over the scene's goals.
 
     Args:
         table: the sampler's table.
-        scene_draw: (*B,) int64, uniform over 0..DRAW_LIMIT-1.
-        goal_draw: the same, drawn independently.
-
-    Returns:
-        the goals' facts, columns (*B,).
+        scene_draw, goal_draw: (*B,) int64, uniform over 0..DRAW_LIMIT-1, independent.
     """
     scene = scene_draw % len(table.scene_goals)
     position = table.scene_first[scene] + goal_draw % table.scene_goals[scene]

@@ -20,7 +20,7 @@ STATE = ("state_id", "goal_id", "scene_id", "elapsed_steps", "shortest_path")
 
 
 class World(NamedTuple):
-    """Lookup tables of an environment. No buffers: access to those takes ten times as long.
+    """Lookup tables of an environment, no buffers, whose access takes ten times as long.
 
     Attributes:
         successor: (S, A) int64, where each action leads.
@@ -44,13 +44,9 @@ def make_world(scenes: SceneSet, goals: Tensor, rewards: Rewards, rows: Tensor |
 
     Args:
         scenes: the world.
-        goals: (G,) int64 global ids.
+        goals: (G,) int64 global ids; a GoalError where no other state can reach one.
         rewards: what a step earns.
-        rows: (*B,) int64, the position of each row's goal in ``goals``, taken modulo G; None when goals are
-            drawn.
-
-    Raises:
-        GoalError: no other state can reach a goal.
+        rows: (*B,) int64, position of each row's goal in ``goals``, modulo G; None when goals are drawn.
 
     >>> world = make_world(SceneSet.bundled("bathroom"), torch.tensor([3, 9]), Rewards.of(), torch.arange(3))
     >>> world.rows.goal
@@ -113,11 +109,7 @@ class Observed(Composite):
 
 
 def env_specs(scenes: SceneSet, batch_size: torch.Size, history: int, shortest_path: bool) -> Specs:
-    """Describe the data of a :class:`TargetNavEnv`; its docstring lists the keys.
-
-    The state, which the environment needs back at every step because it keeps none, is all that it observes
-    but ``collided``.
-    """
+    """Describe the data of a :class:`TargetNavEnv`; its docstring lists the keys."""
     once = (*batch_size, 1)
 
     def count() -> Bounded:

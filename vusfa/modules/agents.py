@@ -252,7 +252,7 @@ class Agent(nn.Module):
 
 
 class _SaysWhatIsMissing:
-    """A step that names the mend where the tensordict lacks an entry that it reads."""
+    """A step whose error names the mend where the tensordict lacks an entry."""
 
     mend: str
 

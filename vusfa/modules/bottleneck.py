@@ -46,7 +46,7 @@ def gaussian_kl(loc: Tensor, scale: Tensor, eps: float = 1e-8) -> Tensor:
 
 
 class GaussianBottleneck(nn.Module):
-    """A code of size 2 E as the mean and the scale of a Gaussian of size E.
+    """Codes of size 2 E as mean and scale of a Gaussian of size E.
 
     Args:
         scale: ``"softplus"`` of the code's second half; or ``"raw"``: that half, as in the released code.

@@ -1,8 +1,4 @@
-"""From a state's id, or from what a camera saw there, to the features of one frame.
-
-Both classes answer two questions: ``lookup(ids)``, the features of states by id (no picture and no feature
-travels to get here), and ``encode(observation)``, the same features for whoever holds the observation itself.
-"""
+"""Features of one frame: ``lookup(ids)`` by the state's id, ``encode(observation)`` of what a camera saw."""
 
 from __future__ import annotations
 
@@ -21,10 +17,7 @@ __all__ = ["FeatureFrames", "PictureFrames", "shrink_pictures"]
 
 
 class FeatureFrames(nn.Module):
-    """Precomputed features of frames: a table of all states, crop 0.
-
-    The table is a buffer that moves with the module and stays out of its ``state_dict``: it belongs to the
-    scenes.
+    """Precomputed features of frames: a table of all states, crop 0, that stays out of the ``state_dict``.
 
     Args:
         features: (S, C, F) float32 of all states, as in ``SceneSet.features``.
@@ -69,7 +62,7 @@ class FeatureFrames(nn.Module):
     def lookup(self, ids: Tensor | None) -> Tensor:
         """Features (\\*B, F) of states (\\*B,) int64; of all S states in order for ``None``.
 
-        Under autocast they come as it would convert them; all are converted once, because they are constants.
+        Under autocast the table is converted once, because it is constant.
         """
         table, device = self.table, self.table.device.type
         if torch.is_autocast_enabled(device):
@@ -79,7 +72,7 @@ class FeatureFrames(nn.Module):
         return table if ids is None else table[ids]
 
     def _apply(self, fn: Any, recurse: bool = True) -> Any:
-        """Every move of a module comes down to this; what was converted is converted anew."""
+        """As every move of a module; what autocast converted is converted anew."""
         self._converted = None
         return super()._apply(fn, recurse)
 
@@ -103,9 +96,8 @@ class FeatureFrames(nn.Module):
 class PictureFrames(nn.Module):
     """Features learned from pictures by three convolutions, the paper's variant "from scratch".
 
-    Pictures are shrunk to ``size`` first (once, for the table). Convolutions of 32 filters 8 x 8 by 4, 64
-    of 4 x 4 by 2 and 64 of 3 x 3 by 1, each with a ReLU, turn 60 x 80 pixels into 4 x 6 x 64 = 1536
-    features; the siamese encoder takes it from there.
+    Pictures are shrunk to ``picture_size``. Convolutions of 32 filters 8 x 8 by 4, 64 of 4 x 4 by 2 and 64 of
+    3 x 3 by 1, each with a ReLU, turn 60 x 80 pixels into 4 x 6 x 64 = 1536 features.
 
     Args:
         pictures: (S, H, W, 3) uint8 of all states for an agent that looks them up, else ``None``.
@@ -185,9 +177,7 @@ def _deviation(table: Tensor) -> Tensor:
 
 
 def shrink_pictures(pictures: Tensor, size: tuple[int, int]) -> Tensor:
-    """Averages pictures (n, 3, H, W) uint8 down to (n, 3, *size) uint8.
-
-    Rounded to uint8 again, so that a table shrunk once and pictures shrunk on the way give the same numbers.
+    """Average pictures (n, 3, H, W) uint8 down to (n, 3, *size) uint8.
 
     >>> shrink_pictures(torch.full((1, 3, 4, 4), 7, dtype=torch.uint8), (2, 2)).unique()
     tensor([7], dtype=torch.uint8)
@@ -202,9 +192,5 @@ def shrink_pictures(pictures: Tensor, size: tuple[int, int]) -> Tensor:
 
 
 def picture_table(scenes: Any) -> Tensor:
-    """All pictures (S, H, W, 3) uint8 of a ``SceneSet``, read from its files.
-
-    Raises:
-        SceneError: a scene has none, or the scenes' pictures differ in size.
-    """
+    """All pictures (S, H, W, 3) uint8 of a ``SceneSet``; a SceneError where there are none of one size."""
     return scenes.pictures(torch.arange(scenes.num_states))

@@ -1,7 +1,6 @@
-"""Affine layers that torch lacks: one weight a scene, and one weight a frame of a history.
+"""Affine layers with one weight per scene, and with one weight per frame of a history.
 
-Both start as ``torch.nn.Linear`` does, uniform in +-1/sqrt(fan_in), which is also the rule of the paper's
-released code.
+Both start as ``torch.nn.Linear`` and the released code do, uniform in +-1/sqrt(fan_in).
 """
 
 from __future__ import annotations
@@ -18,21 +17,20 @@ from vusfa.modules.unique import shapes_may_vary
 
 __all__ = ["HistoryLinear", "SceneLinear"]
 
-#: At most this many outputs a row are computed for nothing before rows are sorted by scene instead.
+#: At most this many outputs per row are computed for nothing before rows are sorted by scene instead.
 _DENSE_OUTPUTS = 64
 #: On an accelerator sorting means waiting for it, so a few scenes are all computed there.
 _DENSE_SCENES = 8
 
 
 class SceneLinear(nn.Module):
-    """An affine layer with weights of its own for each scene: row i meets those of scene ``scene_id[i]``.
+    """Affine layer with weights for each scene: row i meets those of scene ``scene_id[i]``.
 
-    Batches that mix scenes are sorted by scene, so that each scene costs one matrix product of its own
-    rows; small outputs (the logits) are computed for all scenes and picked, which is cheaper than sorting.
-    With one scene it is a plain ``linear``.
+    Batches that mix scenes are sorted by scene, so that each scene costs one matrix product; small outputs
+    (the logits) are computed for all scenes and picked. With one scene it is a plain ``linear``.
 
-    All scenes' weights are one parameter. An optimiser that clips or adapts by parameter sees them together,
-    where the released code has a variable a scene; it matters only for gradients beyond the clipping norm.
+    All scenes' weights are one parameter, where the released code has a variable per scene: an optimizer that
+    clips by parameter sees them together.
 
     Args:
         num_scenes: n.
@@ -62,13 +60,13 @@ class SceneLinear(nn.Module):
         self.reset_parameters()
 
     def reset_parameters(self) -> None:
-        """Draws weights and biases anew, uniform in +-1/sqrt(in_features)."""
+        """Draw weights and biases anew."""
         _uniform_(self.weight, self.bias, fan_in=self.in_features)
 
     def forward(self, x: Tensor, scene_id: RowScenes) -> Tensor:
-        """Maps (\\*B, in) with scene indices (\\*B,) int64 to (\\*B, out); rows sorted by scene, (R, in), may
-        come with their :class:`SortedByScene`, and blocks (n, m, in) with their :class:`SceneBlocks`."""
-        # Converted in one piece: autocast would convert each scene's slice on its own.
+        """Map (\\*B, in) with scene indices (\\*B,) int64 to (\\*B, out); or rows (R, in) sorted by scene,
+        with their :class:`SortedByScene`, or blocks (n, m, in) with their :class:`SceneBlocks`."""
+        # in one piece, not each scene's slice
         weight, bias = for_autocast(self.weight), for_autocast(self.bias)
         if self.num_scenes == 1:
             return padded_linear(x, weight.squeeze(0), bias.squeeze(0))
@@ -102,7 +100,7 @@ class SceneLinear(nn.Module):
 
     def _by_scene(self, rows: Tensor, scene: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
         counts = count_scenes(scene, self.num_scenes)
-        # Unbound, not indexed: the gradients of the slices are then stacked once, not added up in full size.
+        # unbound, not indexed: the gradients of slices are then stacked, not added up in full size
         weights, biases = weight.unbind(0), bias.unbind(0)
         if max(counts) == len(rows):
             only = counts.index(len(rows))
@@ -119,7 +117,6 @@ class SceneLinear(nn.Module):
     def _products(
         rows: Tensor, counts: list[int], weights: tuple[Tensor, ...], biases: tuple[Tensor, ...]
     ) -> list[Tensor]:
-        """Of rows sorted by scene, each scene's with its weights."""
         parts = zip(rows.split(counts), weights, biases, strict=True)
         return [padded_linear(part, weight, bias) for part, weight, bias in parts if len(part)]
 
@@ -129,11 +126,10 @@ class SceneLinear(nn.Module):
 
 
 class HistoryLinear(nn.Module):
-    """An affine layer over the last H frames, kept as one weight a frame: ``sum_h W_h f_h + b``.
+    """Affine layer over the last H frames, with one weight per frame: ``sum_h W_h f_h + b``.
 
-    It is ``Linear(H * F, out)`` on the frames laid end to end. In this form the product of a frame with
-    each of the H weights is a thing of its own (:meth:`project`): a frame that turns up in many histories,
-    at any place, is multiplied once, and the histories are sums of what was looked up (:meth:`gather`).
+    It is ``Linear(H * F, out)`` on concatenated frames. In this form a frame of many histories is multiplied
+    once (:meth:`project`), and histories are sums of looked-up products (:meth:`gather`).
 
     Args:
         history: H.
@@ -161,40 +157,36 @@ class HistoryLinear(nn.Module):
         self.reset_parameters()
 
     def reset_parameters(self) -> None:
-        """Draws weights and biases anew, uniform in +-1/sqrt(H * in_features)."""
+        """Draw weights and biases anew."""
         _uniform_(self.weight, self.bias, fan_in=self.history * self.in_features)
 
     def forward(self, frames: Tensor) -> Tensor:
-        """Maps histories (\\*B, H, F), oldest frame first, to (\\*B, out)."""
-        # A batched product would need the gradient of the weights transposed, which takes longer than itself.
+        """Map histories (\\*B, H, F), oldest frame first, to (\\*B, out)."""
+        # a batched product would transpose the weights' gradient, which takes longer than itself
         biases = (self.bias, *[None] * (self.history - 1))
         slots = zip(frames.unbind(-2), self.weight.unbind(0), biases, strict=True)
         return torch.stack([functional.linear(frame, weight, bias) for frame, weight, bias in slots]).sum(0)
 
     def repeated(self, frame: Tensor) -> Tensor:
-        """Maps one frame (\\*B, F) that fills all H places to (\\*B, out)."""
+        """Map one frame (\\*B, F) that fills all H places to (\\*B, out)."""
         return functional.linear(frame, self.weight.sum(0), self.bias)
 
     def project(self, frames: Tensor) -> Tensor:
-        """Multiplies (D, F) frames with the weights of all places: (D, H, out), without the bias."""
+        """Products (D, H, out) of frames (D, F) with the weights of all places, without the bias."""
         return functional.linear(frames, self.weight.flatten(0, 1)).view(-1, self.history, self.out_features)
 
     def gather(self, projected: Tensor, index: Tensor) -> Tensor:
-        """Histories as sums of projected frames.
+        """Outputs (\\*B, out) of histories.
 
         Args:
             projected: (D, H, out) from :meth:`project`.
             index: (\\*B, H) int64 rows of ``projected``, oldest frame first.
-
-        Returns:
-            (\\*B, out), what :meth:`forward` gives on the frames themselves.
         """
         places = index * self.history + torch.arange(self.history, device=index.device)
-        # One kernel looks up and sums, forwards and backwards; five to ten times faster than indexing,
-        # then sum.
+        # one kernel looks up and sums, five to ten times faster than two
         table = projected.flatten(0, 1)
         if not torch.is_grad_enabled():
-            table = table.detach()  # else what a gradient would need is noted down all the same
+            table = table.detach()  # else what a gradient would need is kept all the same
         sums = functional.embedding_bag(places.view(-1, self.history), table, mode="sum")
         return (sums + self.bias.to(sums.dtype)).view(*index.shape[:-1], -1)
 

@@ -50,7 +50,7 @@ class SortedByScene(NamedTuple):
 
     @classmethod
     def of(cls, scene: Tensor, num_scenes: int) -> SortedByScene:
-        """Counts rows whose scenes (R,) ascend."""
+        """Of rows whose scenes (R,) ascend."""
         return cls(scene, count_scenes(scene, num_scenes))
 
     @classmethod
@@ -66,10 +66,9 @@ class SortedByScene(NamedTuple):
 
 
 class SceneBlocks(NamedTuple):
-    """A few rows laid out scene by scene in blocks of one size, so that a layer is one batched product.
+    """Rows laid out scene by scene in blocks of one size, so that a layer is one batched product.
 
-    A product a scene costs more in calls than in arithmetic where rows are few. What fills a block up is the
-    batch's first row.
+    With few rows a product per scene costs more in calls than in arithmetic. The first row fills blocks up.
 
     Attributes:
         size: rows of a block, m.
@@ -83,8 +82,7 @@ class SceneBlocks(NamedTuple):
 
     @classmethod
     def of(cls, rows: SortedByScene, order: Tensor) -> SceneBlocks | None:
-        """Of what :meth:`SortedByScene.sort` returns; None where there are no rows, or some scene has so many
-        that filling up costs more.
+        """Of what :meth:`SortedByScene.sort` returns; None where filling up costs more, and for no rows.
 
         >>> blocks = SceneBlocks.of(*SortedByScene.sort(torch.tensor([1, 0, 1, 0, 1]), 2))
         >>> blocks.source.tolist(), blocks.place.tolist()

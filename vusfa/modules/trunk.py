@@ -18,7 +18,7 @@ __all__ = ["CachedTrunk", "Fusion", "SceneLayer", "SiameseTrunk", "remember"]
 
 
 class Fusion(nn.Module):
-    """Lays the embeddings of state and goal end to end; a dense layer with ReLU, shared by all scenes.
+    """Dense layer with ReLU on the concatenated embeddings of state and goal, shared by all scenes.
 
     Args:
         embedding_size: E.
@@ -48,10 +48,7 @@ class Fusion(nn.Module):
 
 
 class SiameseTrunk(nn.Module):
-    """Encoder and fusion as one module.
-
-    The fusion's sum has one part of the state alone and one of the goal alone. These are computed per
-    distinct state and goal, and only their sum row by row.
+    """Encoder and fusion as one module: only the sum of the fusion's two parts is computed row by row.
 
     Args:
         encoder: phi.
@@ -88,7 +85,7 @@ class SiameseTrunk(nn.Module):
         return *joined(of_state.gather(states.inverse, batch), of_goal.gather(goals.inverse, batch)), fused
 
     def fused(self, state: Tensor, goal: Tensor) -> Tensor:
-        """The fused (\\*B, hidden) alone: no scale is computed and no embedding looked up."""
+        """The fused (\\*B, hidden) alone."""
         try:
             return self._fused(state, goal)
         except (IndexError, RuntimeError):
@@ -103,10 +100,10 @@ class SiameseTrunk(nn.Module):
 
 
 class CachedTrunk:
-    """A trunk's ``fused`` while its weights stand still: whatever depends on one frame is computed once.
+    """A trunk's ``fused`` while its weights stand still: what depends on one frame is computed once.
 
     Args:
-        trunk: reads ids. Its weights are read now; later changes do not arrive here.
+        trunk: reads ids; its weights are read now.
         goals: (G,) ids of the only states that will be goals; None for all of the world.
         rows: number of rows that will be asked for; None for many. With fewer rows than half of the world's
             states, a frame is computed when it is first asked for, else all frames now.
@@ -140,7 +137,7 @@ class CachedTrunk:
             self.frames = first.project(features)
         self.row: Tensor | None = None
         if goals is not None:
-            # -1 where a state is no goal: looking it up fails, and does not mistake it for another one
+            # -1 where a state is no goal: looking it up fails
             self.row = torch.full((len(features),), -1, dtype=torch.int64, device=features.device)
             self.row[goals] = torch.arange(len(goals), device=features.device)
             features = features[goals]
