@@ -48,6 +48,7 @@ nb_execution_in_temp = True
 nb_execution_timeout = 600
 nb_execution_raise_on_error = True
 nb_merge_streams = True
+nb_render_markdown_format = "myst"
 # Annotations are short, and two modules have a class Comparison.
 suppress_warnings = ["mystnb.unknown_mime_type", "ref.python"]
 
