@@ -80,3 +80,5 @@ html_theme_options: dict[str, Any] = {
     "footer_end": ["theme-version"],
 }
 html_show_sourcelink = False
+# Pages without pages below them need no tree of their section.
+html_sidebars = {"start": [], "results": []}

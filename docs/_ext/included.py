@@ -25,6 +25,8 @@ def include_files(app: Sphinx, page: str, source: list[str]) -> None:
         path = Path(app.srcdir, link[1]).resolve()
         app.env.note_dependency(str(path))
         found = path.read_text(encoding="utf-8").replace("](docs/", "](")
+        if link[1].startswith("generated/"):
+            return f":::{{div}} numbers\n{found}\n:::"
         return _BESIDE.sub(lambda name: f"]({name[1].lower()}.md)", found)
 
     source[0] = _LINK.sub(text, source[0])
