@@ -306,6 +306,17 @@ def test_missing_entries_are_named(name: str, missing: Any, message: str) -> Non
         make(CASES[name])(transitions(3).exclude(missing))
 
 
+@pytest.mark.parametrize("name", ["goal_id", "steps_to_goal", "reward"])
+def test_shapes_are_not_broadcast(name: str) -> None:
+    td = transitions(3)
+    if name == "reward":
+        td["next", "reward"] = td["next", "reward"].expand(3, 3)
+    else:
+        td[name] = td[name].unsqueeze(-1)
+    with pytest.raises(ValueError, match="shapes differ"):
+        make(CASES["reward" if name == "reward" else "hindsight"])(td)
+
+
 def test_without_a_tensordict(case: Case) -> None:
     loss, td = make(case), transitions(7)
     arguments = {

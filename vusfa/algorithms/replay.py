@@ -113,7 +113,7 @@ class HindsightSampler(RandomSampler):
         return self._states[self._first[scene] + draw.long()]
 
     def state_dict(self) -> dict[str, Any]:
-        """Seen states."""
+        """Seen states, by their scenes."""
         return {"scene_of": self.scene_of}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:

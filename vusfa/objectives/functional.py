@@ -160,7 +160,7 @@ def successor_loss(successor: Tensor, target: Tensor) -> Tensor:
     >>> successor_loss(torch.tensor([[1.0, 2.0]]), torch.tensor([[0.0, 4.0]]))
     tensor([2.5000])
     """
-    _assert_same_shape("successor_loss", successor=successor, target=target)
+    assert_same_shape("successor_loss", successor=successor, target=target)
     return _MeanSquare.apply(successor - target.detach())
 
 
@@ -194,7 +194,7 @@ def policy_gradient_loss(log_prob: Tensor, advantage: Tensor) -> Tensor:
     >>> policy_gradient_loss(torch.tensor([-0.5]), torch.tensor([3.0]))
     tensor([1.5000])
     """
-    _assert_same_shape("policy_gradient_loss", log_prob=log_prob, advantage=advantage)
+    assert_same_shape("policy_gradient_loss", log_prob=log_prob, advantage=advantage)
     return -log_prob * advantage.detach()
 
 
@@ -248,7 +248,7 @@ def explained_variance(target: Tensor, prediction: Tensor, mask: Tensor | None =
     >>> explained_variance(torch.tensor([1.0, 2.0, 3.0]), torch.zeros(3))
     tensor(0.)
     """
-    _assert_same_shape("explained_variance", target=target, prediction=prediction)
+    assert_same_shape("explained_variance", target=target, prediction=prediction)
     target, prediction = target.detach(), prediction.detach()
     weight = torch.ones_like(target) if mask is None else mask.to(target.dtype)
     count = weight.sum().clamp_min(1.0)
@@ -262,7 +262,8 @@ def explained_variance(target: Tensor, prediction: Tensor, mask: Tensor | None =
     return torch.where(total > 0, 1.0 - variance(target - prediction) / total, 0.0)
 
 
-def _assert_same_shape(function: str, **tensors: Tensor) -> None:
+def assert_same_shape(function: str, **tensors: Tensor) -> None:
+    """Raise a ``ValueError`` where shapes differ: they would be broadcast without a word."""
     shapes = {name: tuple(tensor.shape) for name, tensor in tensors.items()}
     if len(set(shapes.values())) > 1:
         raise ValueError(f"{function}: shapes differ: {shapes}; give equal ones")

@@ -21,6 +21,7 @@ from torch import Tensor
 
 from vusfa.objectives.common import NetworkLoss
 from vusfa.objectives.distribution import action_log_prob
+from vusfa.objectives.functional import assert_same_shape
 from vusfa.objectives.networks import entry, run_actor_critic, run_critic, select_inputs
 
 __all__ = ["HindsightKeys", "HindsightLoss", "expectile_loss", "relabelled_target", "walked_return"]
@@ -222,6 +223,7 @@ class HindsightLoss(NetworkLoss):
 
         Raises:
             KeyError: an entry is missing.
+            ValueError: goals or steps to them are not one number per row.
         """
         self.check()
         keys, actor, critic = self.tensor_keys, self.actor_network, self.critic_network
@@ -231,6 +233,7 @@ class HindsightLoss(NetworkLoss):
         following = entry(self, tensordict, ("next", keys.state), "collect with compact_obs=False")
         hint = "HindsightReplay.sample() writes it; give 0 where the agent did not go to the goal"
         steps = entry(self, tensordict, keys.steps_to_goal, hint)
+        assert_same_shape("HindsightLoss", state=state[..., -1], goal=goal, steps_to_goal=steps)
         inputs = select_inputs(tensordict, *actor.in_keys, *critic.in_keys)
         with self._params_in_place():
             distribution, written = run_actor_critic(actor, critic, inputs)

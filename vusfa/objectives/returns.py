@@ -13,7 +13,7 @@ from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor
 from torchrl.objectives.value import ValueEstimatorBase
 
-from vusfa.objectives.functional import lambda_return
+from vusfa.objectives.functional import lambda_return, successor_return
 from vusfa.objectives.keys import EstimatorKeys
 from vusfa.objectives.networks import entry, use_params
 from vusfa.objectives.rollout_values import check_next, evaluate_rollout
@@ -202,18 +202,17 @@ class USFEstimator(ValueEstimatorBase):
             wanted += [keys.successor_features, keys.state_embedding]
         check_next(self, data, self.value_network)
         with contextlib.nullcontext() if params is None else use_params(self.value_network, params):
-            root, following = evaluate_rollout(
-                self.value_network, data, ended.any(-1), wanted, written, index, [keys.value]
+            value, following = evaluate_rollout(
+                self.value_network, data, ended.any(-1), wanted, written, index
             )
-        value = root[0].to(reward.dtype)
         if self.has_successor:
             ended, terminated = ended.any(-1, keepdim=True), terminated.any(-1, keepdim=True)
         at_next = [x.to(reward.dtype) for x in following]  # V, psi and phi of s_{t+1}
-        rates = float(self.gamma), float(self.lmbda)
-        returns = [lambda_return(reward, at_next[0], *rates, ended, terminated)]
+        gamma, lmbda = float(self.gamma), float(self.lmbda)
+        returns = [lambda_return(reward, at_next[0], gamma, lmbda, ended, terminated)]
         if self.has_successor:  # phi from s_{t+1} on: the paper's Eqs. 4 and 13 and its code, not its Eq. 6
-            returns.append(lambda_return(at_next[2], at_next[1], *rates, ended, terminated))
-        advantage = returns[0] - value
+            returns.append(successor_return(at_next[2], at_next[1], gamma, ended, terminated, lmbda))
+        advantage = returns[0] - value.to(reward.dtype)
         if self.normalize_advantage or self.average_gae:
             advantage = _normalize(advantage, mask, self.min_advantage_std, int(self.average_gae))
         return TensorDict(dict(zip(self.out_keys, [advantage, *returns], strict=True)), data.batch_size)

@@ -12,6 +12,7 @@ from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor
 
 from vusfa.objectives.common import NetworkLoss
+from vusfa.objectives.functional import assert_same_shape
 from vusfa.objectives.networks import entry
 from vusfa.objectives.rollout_values import check_next
 
@@ -34,13 +35,18 @@ def reward_regression_loss(embedding: Tensor, weights: Tensor, reward: Tensor) -
     Returns:
         (\*B,).
 
+    Raises:
+        ValueError: shapes do not fit each other.
+
     >>> import torch
     >>> phi, omega = torch.tensor([[1.0, 2.0]]), torch.tensor([[3.0, -1.0]])
     >>> reward_regression_loss(phi, omega, torch.tensor([[4.0]]))
     tensor([9.])
     """
     predicted = (embedding.detach().float() * weights.float()).sum(-1)
-    return (predicted - reward.squeeze(-1)).square()
+    reward = reward.squeeze(-1) if reward.ndim > predicted.ndim else reward
+    assert_same_shape("reward_regression_loss", predicted=predicted, reward=reward)
+    return (predicted - reward).square()
 
 
 @dataclass

@@ -49,8 +49,7 @@ def evaluate_rollout(
     out_keys: list[NestedKey],
     written: TensorDictBase | None = None,
     index: Tensor | None = None,
-    at_root: list[NestedKey] | None = None,
-) -> tuple[list[Tensor], list[Tensor]]:
+) -> tuple[Tensor, list[Tensor]]:
     """A critic's outputs at the root states of a rollout and at its next states.
 
     Args:
@@ -58,13 +57,11 @@ def evaluate_rollout(
         data: ``(*batch, T)``, the critic's inputs at the root and under ``"next"``; what ``"next"`` lacks,
             such as the goal, is the root's.
         ended: ``(*batch, T)``, bool: the next root does not follow from this step.
-        out_keys: of the outputs.
+        out_keys: of the outputs, the value's the first.
         written, index: see :meth:`vusfa.objectives.USFEstimator.forward`.
-        at_root: of the outputs at the root states; ``out_keys`` when ``None``.
 
     Returns:
-        two lists of ``(*batch, T, ...)``: at the root states, in the order of ``at_root``, and at the next
-        states, in that of ``out_keys``.
+        the value at the root states, and every output at the next states, ``(*batch, T, ...)``.
     """
     in_keys = [unravel_key(key) for key in critic.in_keys]  # type: ignore[attr-defined]
     root = data.select(*in_keys, strict=False)
@@ -72,8 +69,7 @@ def evaluate_rollout(
     outside = ended.clone()
     outside[..., -1] = True
     if any(map(_is_start_mark, in_keys)):
-        first, second = _evaluate_sequences(critic, root, following, outside, in_keys, out_keys)
-        return first if at_root is None else [first[out_keys.index(key)] for key in at_root], second
+        return _evaluate_sequences(critic, root, following, outside, in_keys, out_keys)
 
     # one flat batch of the roots, unless they are known, and of next states that are no root
     rows = outside.reshape(-1).nonzero().squeeze(-1)
@@ -94,15 +90,9 @@ def evaluate_rollout(
     known_rows = len(values[out_keys[0]]) - len(rows)
     next_rows[rows] = torch.arange(known_rows, known_rows + len(rows), device=rows.device)
 
-    def taken(key: NestedKey, places: Tensor) -> Tensor:
-        return gather(values[key], places.view(shape))
-
-    def whole(key: NestedKey) -> Tensor:
-        return values[key][:steps].reshape(*shape, *values[key].shape[1:])
-
-    wanted = out_keys if at_root is None else at_root
-    first = [whole(key) if index is None else taken(key, root_rows) for key in wanted]
-    return first, [taken(key, next_rows) for key in out_keys]
+    value = values[out_keys[0]]
+    at_root = value[:steps].reshape(*shape, -1) if index is None else gather(value, root_rows.view(shape))
+    return at_root, [gather(values[key], next_rows.view(shape)) for key in out_keys]
 
 
 def _evaluate_sequences(
@@ -112,14 +102,14 @@ def _evaluate_sequences(
     outside: Tensor,
     in_keys: list[NestedKey],
     out_keys: list[NestedKey],
-) -> tuple[list[Tensor], list[Tensor]]:
+) -> tuple[Tensor, list[Tensor]]:
     """The same for recurrent critics: T+1 states in order, and sequences of one state."""
     time = root.batch_dims - 1
     end = _complete(following[..., -1:], root[..., -1:], in_keys)
     with set_recurrent_mode(True):
         outputs = critic(torch.cat([root, end], time))
     values = [outputs.get(key) for key in out_keys]
-    at_root = [value.narrow(time, 0, outside.shape[-1]) for value in values]
+    at_root = values[0].narrow(time, 0, outside.shape[-1])
     at_next = [value.narrow(time, 1, outside.shape[-1]) for value in values]
     inside = outside.clone()
     inside[..., -1] = False
