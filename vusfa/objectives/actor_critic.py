@@ -50,7 +50,7 @@ class Results(NamedTuple):
 
 
 class ActorCriticLoss(NetworkLoss):
-    """Runs an actor and a critic once, computes targets, and has the three terms of A2C."""
+    """Base of USFLoss: one pass through actor and critic, targets, and the three terms of A2C."""
 
     tensor_keys: LossKeys
     default_value_estimator = ValueEstimators.TD1

@@ -25,7 +25,7 @@ _NETWORKS = {
 
 
 class NetworkLoss(LossModule):
-    """A loss of an ``actor_network``, a ``critic_network``, or both, in this order.
+    """Base of losses of an ``actor_network``, a ``critic_network``, or both, in this order.
 
     The other arguments are those of :class:`~vusfa.objectives.USFLoss`.
     """

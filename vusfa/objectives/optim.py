@@ -143,7 +143,7 @@ def clipped(grad: Tensor, max_norm: float | None) -> Tensor:
 
 
 class DualAscent:
-    r"""Adapts the multiplier of a loss's information bottleneck, as a target updater adapts target networks.
+    r"""Dual ascent of the multiplier of a loss's information bottleneck, stepped like a target updater.
 
     .. math::
         \beta \leftarrow \max\left(0, \beta + n \alpha (KL - I_c)\right)

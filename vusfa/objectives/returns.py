@@ -22,7 +22,7 @@ __all__ = ["USFEstimator"]
 
 
 class USFEstimator(ValueEstimatorBase):
-    r"""Writes ``advantage``, ``value_target`` and, where the critic has successor features,
+    r"""Estimator of ``advantage``, ``value_target`` and, where the critic has successor features,
     ``successor_target``.
 
     .. math::
@@ -43,15 +43,14 @@ class USFEstimator(ValueEstimatorBase):
         value_network: the critic; writes the value and, if it has them, successor features and state
             embedding.
         gamma: discount per step; a buffer.
-        lmbda: weight of the longer return, in [0, 1]; 1 is the n-step return up to the rollout's end, 0 the
+        lmbda: weight of the longer return, in [0, 1]: 1 is the n-step return up to the rollout's end, 0 the
             one-step target; a buffer.
-        normalize_advantage: shift and scale a batch's advantages to mean 0 and deviation 1; the deviation is
-            the population's.
-        average_gae: the same with the sample's deviation, as ``average_gae`` of TorchRL's GAE.
-        min_advantage_std: divide by no less than this. While rewards are rare all advantages are small errors
-            of the critic; brought to deviation 1 they would move the policy at random.
+        normalize_advantage: shift and scale a batch's advantages to mean 0 and (population) deviation 1.
+        average_gae: the same with the sample's deviation, as in TorchRL's GAE.
+        min_advantage_std: the least divisor. While rewards are rare all advantages are small errors of the
+            critic; brought to deviation 1 they would move the policy at random.
         bootstrap_at_timeout: ``False`` takes a time-out for a terminal, as the paper's released code does.
-        device: accepted for TorchRL's sake; the estimator follows its input.
+        device: not used; the estimator follows its input.
 
     Raises:
         ValueError: a hyperparameter out of its range.
@@ -59,13 +58,9 @@ class USFEstimator(ValueEstimatorBase):
     >>> from tensordict.nn import TensorDictModule
     >>> critic = TensorDictModule(lambda x: x.sum(-1, keepdim=True), in_keys=["x"], out_keys=["state_value"])
     >>> no = torch.zeros(3, 1, dtype=torch.bool)
-    >>> rollout = TensorDict({
-    ...     "x": torch.tensor([[0.0], [1.0], [2.0]]),
-    ...     "next": {
-    ...         "x": torch.tensor([[1.0], [2.0], [3.0]]),
-    ...         "reward": torch.ones(3, 1), "done": no, "terminated": no,
-    ...     },
-    ... }, [3])
+    >>> x = torch.tensor([[0.0], [1.0], [2.0]])
+    >>> following = {"x": x + 1, "reward": torch.ones(3, 1), "done": no, "terminated": no}
+    >>> rollout = TensorDict({"x": x, "next": following}, [3])
     >>> rollout = USFEstimator(value_network=critic, gamma=0.5)(rollout)
     >>> rollout["value_target"].squeeze(-1)
     tensor([2.1250, 2.2500, 2.5000])

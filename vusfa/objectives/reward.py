@@ -59,7 +59,7 @@ class RewardKeys:
 
 
 class RewardRegressionLoss(NetworkLoss):
-    """Trains the layers behind a critic's ``reward_weights``, and nothing else, to predict the reward.
+    """Regression of the reward, which trains the layers behind a critic's ``reward_weights`` and no others.
 
     For successor features without a gradient of the value: beside :class:`~vusfa.objectives.USFLoss` with
     ``critic_coeff=0``, and usually an autoencoder's phi.
