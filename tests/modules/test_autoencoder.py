@@ -27,7 +27,7 @@ def test_pretraining_explains_most_of_what_was_seen(rooms: SceneSet, history: in
     sizes = {"history": history, "hidden_size": 64, "embedding_size": 32}
     agent = make_agent("usfa", scenes=rooms, pretrained="autoencoder", **sizes)
     before = pretrain_autoencoder(agent, steps=0)
-    after = pretrain_autoencoder(agent, steps=300)
+    after = pretrain_autoencoder(agent, steps=150, batch_size=128, lr=3e-3)
     features = agent.encoder.frames.lookup(None)
     centred = features - features.mean(0)
     best = torch.linalg.svdvals(centred).square()

@@ -148,8 +148,8 @@ class TargetNavVector(TellsLimit, VectorEnv[Observation, np.ndarray, np.ndarray]
             raise ActionError(f"actions are of shape {actions.shape}; give one each, ({self.num_envs},)")
         if again.any() and self.autoreset_mode == AutoresetMode.DISABLED:
             raise ConfigError(
-                f"the episode of row {int(again.argmax())} is over; reset it with options={{'reset_mask': ...}}"
-                ", or make the environment with autoreset_mode='NextStep'"
+                f"the episode of row {int(again.argmax())} is over; reset it with a reset_mask, or make"
+                " the environment with autoreset_mode='NextStep'"
             )
         reward, terminated, truncated = self.rows.move(
             np.where(again, 0, actions) if again.any() else actions
