@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import csv
 import json
 import math
 from pathlib import Path
 
 import pytest
 
-from vusfa.files import replacing, write_csv, write_json
+from vusfa.errors import ConfigError
+from vusfa.files import plain_cell, replacing, write_csv, write_json
 
 
 def test_a_failure_leaves_the_old_file_and_nothing_else(tmp_path: Path):
@@ -40,3 +42,33 @@ def test_no_number_is_an_empty_field_and_a_null(tmp_path: Path):
     assert write_csv(tmp_path / "b.csv", [], ["x", "y"]).read_text() == "x,y\n"
     read = json.loads(write_json(tmp_path / "c.json", {"rows": (row,)}).read_text())
     assert read == {"rows": [{"name": "ä, b", "rate": None, "count": 3}]}
+
+
+@pytest.mark.parametrize("text", ["=1+1", "+cmd|' /C calc'!A0", "-2+3", "@SUM(A1)", "\t=1", "\r=1"])
+def test_a_formula_is_text_and_comes_back(tmp_path: Path, text: str):
+    path = write_csv(tmp_path / "a.csv", [{text: text, "value": -0.5}])
+    with open(path, newline="", encoding="utf-8") as file:
+        head, row = csv.reader(file)
+    assert head[0][0] == row[0][0] == "'"
+    assert row[1] == "-0.5"
+    if text.isprintable():
+        assert plain_cell(row[0]) == plain_cell(head[0]) == text
+
+
+@pytest.mark.parametrize("text", ["-0.5", "+3", "-inf", "1e-3", "", "hall", "a=b", "'quoted'"])
+def test_numbers_and_plain_text_stay(tmp_path: Path, text: str):
+    path = write_csv(tmp_path / "a.csv", [{"x": text, "y": 0}])
+    assert path.read_text() == f"x,y\n{text},0\n"
+    assert plain_cell(text) == text
+
+
+@pytest.mark.parametrize(
+    "name", ["hall\x1b[2J\x1b]0;x\x07", "a\x9b31m", "a\u202etxt.exe", "caf\udce9", "a\rb"]
+)
+def test_names_move_no_cursor(tmp_path: Path, name: str):
+    for text in (
+        str(ConfigError(f"{name}: damaged")),
+        write_csv(tmp_path / "a.csv", [{"x": name}]).read_text(),
+    ):
+        assert "\\" in text
+        assert not set(text) & set("\x1b\x07\x9b\u202e\udce9\r")

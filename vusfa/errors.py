@@ -7,6 +7,8 @@ them.
 
 from __future__ import annotations
 
+import re
+
 __all__ = [
     "ActionError",
     "CameraError",
@@ -17,7 +19,21 @@ __all__ = [
     "SceneError",
     "VusfaError",
     "WorkerError",
+    "printable",
 ]
+
+# Control characters but tab and newline, marks that turn the direction of text, halves of characters.
+_UNPRINTABLE = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u200e\u200f\u202a-\u202e\u2066-\u2069\ud800-\udfff]")
+
+
+def printable(text: str) -> str:
+    r"""Text of a file, such as a scene's name, as a terminal may get it: what would move its cursor, set its
+    colors or turn its direction is spelled out.
+
+    >>> printable("hall\x1b[2J")
+    'hall\\x1b[2J'
+    """
+    return _UNPRINTABLE.sub(lambda match: match[0].encode("unicode_escape").decode(), text)
 
 
 class VusfaError(ValueError):
@@ -28,6 +44,10 @@ class VusfaError(ValueError):
     ...
     vusfa.errors.VusfaError: room.h5: dataset 'graph' is missing; write it as (N, A) int64
     """
+
+    def __str__(self) -> str:
+        """The message, :func:`printable`, for it often holds what a file says."""
+        return printable(super().__str__())
 
 
 class SceneError(VusfaError):

@@ -17,11 +17,12 @@ from multiprocessing.util import Finalize
 from pathlib import Path
 from typing import Any
 
-from vusfa.errors import ConfigError, ResultError
+from vusfa.errors import ConfigError, ResultError, printable
 
 __all__ = [
     "cannot_write",
     "check_folder",
+    "plain_cell",
     "remove_leftovers",
     "replacing",
     "say",
@@ -30,6 +31,8 @@ __all__ = [
     "write_json",
     "write_text",
 ]
+
+_FORMULA = "=+-@\t\r"  # what a spreadsheet takes for the beginning of a formula
 
 
 def check_folder(path: str | Path, setting: str) -> Path:
@@ -155,16 +158,44 @@ def say(text: str) -> None:
 def write_csv(
     path: str | Path, rows: Iterable[Mapping[str, Any]], columns: Sequence[str] | None = None
 ) -> Path:
-    """Write rows as CSV, atomically; the columns are those of the first row unless given. NaN becomes an
-    empty field."""
+    """Write rows as CSV, atomically; the columns are those of the first row unless given.
+
+    NaN becomes an empty field. Text that a spreadsheet would take for a formula gets an apostrophe before it,
+    which :func:`plain_cell` takes off again.
+    """
     rows = list(rows)
     names = list(columns if columns is not None else rows[0] if rows else [])
     text = io.StringIO(newline="")
     writer = csv.DictWriter(text, names, lineterminator="\n")
-    writer.writeheader()
+    writer.writerow({name: _cell(name) for name in names})
     for row in rows:
-        writer.writerow({key: "" if _is_nan(value) else value for key, value in row.items()})
+        writer.writerow({key: _cell(value) for key, value in row.items()})
     return write_text(path, text.getvalue())
+
+
+def plain_cell(text: str) -> str:
+    """Text of a CSV field as it was given to :func:`write_csv`.
+
+    >>> plain_cell("'=1+1"), plain_cell("'tis a hall")
+    ('=1+1', "'tis a hall")
+    """
+    return text[1:] if text[:1] == "'" and text[1:2] in _FORMULA and text[1:2] else text
+
+
+def _cell(value: Any) -> Any:
+    if not isinstance(value, str):
+        return "" if _is_nan(value) else value
+    if value[:1] in _FORMULA and value and not _is_number(value):
+        value = f"'{value}"
+    return printable(value)
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
 
 
 def write_json(path: str | Path, content: Any) -> Path:

@@ -212,3 +212,11 @@ def test_the_table_does_not_repeat_itself(episodes: Episodes):
 def test_columns_must_agree(episodes: Episodes):
     with pytest.raises(ValueError, match="columns"):
         Episodes(**{**vars(episodes), "length": torch.tensor([1])})
+
+
+def test_names_are_neither_markup_nor_commands_to_the_terminal(episodes: Episodes):
+    page = io.StringIO()
+    renamed = Episodes(**{**vars(episodes), "scene_names": ("[red]hall[/nothing]", "attic\x1b[2J")})
+    print_summary(summary(renamed, "[link=x]walker"), Console(file=page, width=200), note="[bold]\x07")
+    for text in ("[red]hall[/nothing]", "attic\\x1b[2J", "[link=x]walker", "[bold]\\x07"):
+        assert text in page.getvalue()

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from vusfa.errors import SceneError
+from vusfa.errors import SceneError, printable
 
 if TYPE_CHECKING:
     from vusfa.scenes import Scene
@@ -157,7 +157,7 @@ def show(
 
     (loaded,) = SceneSet.open(scene).scenes
     for line in _description(loaded, summarize(loaded)):
-        typer.echo(line)
+        typer.echo(printable(line))
     typer.echo(f"drawn: {save_sheet(loaded, output or Path(Path(scene).stem + '.png'), pictures)}")
 
 
@@ -219,7 +219,7 @@ def check(
             found[path] = validate(path)
             advance()
     for path, faults in found.items():
-        typer.echo("\n".join(faults) if faults else f"{path}: sound")
+        typer.echo(printable("\n".join(faults) if faults else f"{path}: sound"))
     faulty = sum(map(bool, found.values()))
     if faulty:
         typer.echo(f"error: {faulty} of {len(found)} files have faults", err=True)

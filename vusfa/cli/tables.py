@@ -8,7 +8,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from vusfa.errors import SceneError
+from vusfa.errors import SceneError, printable
 from vusfa.sources.summary import Group, Summary
 
 __all__ = ["print_wide", "table_of_groups", "table_of_scenes"]
@@ -36,12 +36,12 @@ def table_of_scenes(rows: Sequence[tuple[str, Summary | SceneError]], walk_steps
     table.add_column("file", overflow="fold")
     for label, found in rows:
         if isinstance(found, SceneError):
-            table.add_row(Text("faulty", "red"), *[""] * 10, Text(label))
+            table.add_row(Text("faulty", "red"), *[""] * 10, Text(printable(label)))
             continue
         height, width = found.picture_shape[:2] if found.picture_shape else (0, 0)
         crops = f"{found.crops} x " if found.crops > 1 else ""
         table.add_row(
-            Text(found.name),
+            Text(printable(found.name)),
             *(str(number) for number in (found.states, found.cells, found.actions)),
             f"{crops}{found.features}",
             str(found.islands),
@@ -50,7 +50,7 @@ def table_of_scenes(rows: Sequence[tuple[str, Summary | SceneError]], walk_steps
             f"{found.mean_path:.1f}",
             str(found.longest_path),
             f"{width} x {height}" if found.picture_shape else "none",
-            Text(label),
+            Text(printable(label)),
         )
     return table
 
@@ -66,7 +66,7 @@ def table_of_groups(groups: Sequence[Group]) -> Table:
         table.add_column(column, justify="right")
     for group in groups:
         table.add_row(
-            Text(group.name),
+            Text(printable(group.name)),
             str(group.scenes),
             str(group.states),
             f"{100 * (1 - group.look_alikes):.2f} %",

@@ -10,6 +10,7 @@ import pandas as pd
 from torch import Tensor
 
 from vusfa.envs.dynamics import MAX_STEPS
+from vusfa.errors import printable
 from vusfa.evaluation.episodes import Episodes
 from vusfa.evaluation.long_table import (
     SUBSETS,
@@ -139,6 +140,7 @@ def print_summary(rows: Sequence[Row], console: Console | None = None, note: str
     from rich import box  # of the extra "recipes"; the rest of this module does without
     from rich.console import Console
     from rich.table import Table
+    from rich.text import Text
 
     console = console or Console()
     names = [name for name in metric_columns(rows) if not all(math.isnan(row[name]) for row in rows)]
@@ -158,12 +160,12 @@ def print_summary(rows: Sequence[Row], console: Console | None = None, note: str
             group = [row for row in chosen if row["scene"] == scene]
             for place, row in enumerate(group):
                 table.add_row(
-                    scene if place == 0 else "",
-                    row["policy"],
+                    Text(printable(scene) if place == 0 else ""),
+                    Text(printable(row["policy"])),
                     *(metric.text(row[metric.name]) for metric in metrics),
                     end_section=place == len(group) - 1,
                 )
         console.print(table)
     console.print(f"{', '.join(f'{metric.short}: {metric.heading}' for metric in metrics)}")
     if note:
-        console.print(note)
+        console.print(Text(printable(note)))

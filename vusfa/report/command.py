@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Literal
 
 from vusfa.envs.dynamics import MAX_STEPS
+from vusfa.errors import printable
 from vusfa.files import check_folder
 from vusfa.report.build import write_report
 from vusfa.report.cells import read_source
@@ -71,7 +72,7 @@ def report_runs(
         megabytes=megabytes,
         command=shlex.join(["vusfa", "report", *map(_shown, sources), "--out", _shown(str(out))]),
         scenes=None if scenes is None else SceneSet.open(scenes),
-        tell=lambda line: print(line, file=sys.stderr),
+        tell=lambda line: print(printable(line), file=sys.stderr),
     )
     read = [run for source in sources for run in read_source(source, mode, runs)]
     paths, tables = write_report(read, out, options)

@@ -6,6 +6,7 @@ import math
 from collections.abc import Iterable, Sequence
 from typing import Any
 
+from vusfa.errors import printable
 from vusfa.evaluation.metrics import METRICS, get_metric
 from vusfa.evaluation.statistics import Estimate
 
@@ -73,4 +74,7 @@ def _text(name: str, value: Any) -> str:
         )
     if isinstance(value, int):
         return f"{value:,}"
-    return "–" if value is None else get_metric(value).heading if _is_metric(value) else str(value)
+    if value is None:
+        return "–"
+    text = get_metric(value).heading if _is_metric(value) else printable(str(value))
+    return text.replace("|", "\\|").replace("\n", " ")

@@ -17,6 +17,7 @@ from vusfa.errors import CheckpointError, ConfigError
 from vusfa.evaluation import Episodes
 from vusfa.evaluation.exact import ExactGoals
 from vusfa.evaluation.long_table import WITHIN, episode_rows, exact_rows, join_tables, row_label
+from vusfa.files import plain_cell
 from vusfa.limits import brief
 from vusfa.reading import check_fields, read_csv, read_json
 from vusfa.report.curve import read_metrics
@@ -198,6 +199,7 @@ def read_episodes(path: Path, max_steps: int) -> Episodes:
         raise ConfigError(f"{path}: {lacks}; {_AGAIN}")
     names = tuple(dict.fromkeys(content["scene"]))
     index = {name: place for place, name in enumerate(names)}
+    names = tuple(plain_cell(name) for name in names)
     columns = {}
     for name in [*_COLUMNS, *({"remaining"} & content.keys())]:
         whole = np.abs(content[name]) < 2**53

@@ -10,6 +10,8 @@ from contextlib import suppress
 from types import TracebackType
 from typing import TYPE_CHECKING
 
+from vusfa.errors import printable
+
 if TYPE_CHECKING:
     from rich.console import Console
     from rich.live import Live
@@ -71,7 +73,8 @@ class ProgressLine:
         self._recent.append((now, frames))
         (then, before) = self._recent[0]
         speed = (frames - before) / (now - then) if now > then else math.nan
-        self._line = describe(frames, self._total, speed, self._success, self._ratio, self._unit)
+        line = describe(frames, self._total, speed, self._success, self._ratio, self._unit)
+        self._line = printable(line)
         if self._live is None and now - self._printed >= self._every:
             self._print(now)
 
@@ -94,7 +97,7 @@ class ProgressLine:
     def _print(self, now: float) -> None:
         self._printed = now
         with suppress(OSError):
-            self._console.print(self._line, soft_wrap=True, highlight=False)
+            self._console.print(self._line, soft_wrap=True, highlight=False, markup=False)
 
 
 class EvaluationProgress:
