@@ -284,5 +284,9 @@ def test_names_are_text_never_markup(chromium: Any, runs: list[LoggedRun], tmp_p
         "document.body.append(Object.assign(document.createElement('script'), {text: 'hacked = 2'}))"
     )
     assert tab.evaluate("window.hacked") is None
+    tab.evaluate(
+        "document.body.append(Object.assign(document.createElement('style'), {textContent: '*{top:1px}'}))"
+    )
+    assert tab.evaluate("getComputedStyle(document.body).top") == "auto"
     assert all("Content Security Policy" in line for line in complaints)
     tab.close()

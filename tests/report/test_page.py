@@ -32,6 +32,7 @@ def test_the_page_stands_alone(page: Path):
     assert text.count("</script>") == 3 == text.count("<script")
     assert not re.findall(r"<(?:link|iframe|img)[^>]+(?:href|src)=", text)
     assert "default-src 'none'" in text
+    assert "unsafe" not in text[: text.index("<title>")]
     assert "&lt;/script&gt;</title>" in text
     assert data_of(page)["title"] == "A <b>title</b> & </script>"
 
