@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from vusfa.errors import GoalError
 from vusfa.scenes import Scene, bundled_names, markov
 from vusfa.scenes import graph as graphs
+from vusfa.scenes.validation import distance_faults
 
 
 @st.composite
@@ -154,13 +155,33 @@ def test_many_blocks_of_goals_join_up(monkeypatch: pytest.MonkeyPatch) -> None:
     policies = rng.dirichlet(np.ones(3), size=(20, 20))
     uniform = np.full((20, 3), 1 / 3)
     whole = [markov.arrival_probability(table, policy, range(20), 9) for policy in (policies, uniform)]
-    distance = graphs.shortest_path_distances(table)
     monkeypatch.setattr(markov, "goals_at_once", lambda states, per_goal: 3)
-    monkeypatch.setattr(graphs, "_SEARCH_ELEMENTS", 60)
     parts = [markov.arrival_probability(table, policy, range(20), 9) for policy in (policies, uniform)]
     assert torch.equal(parts[0], whole[0])
     assert torch.equal(parts[1], whole[1])
-    assert torch.equal(graphs.shortest_path_distances(table), distance)
+
+
+def test_distances_are_right_exactly_when_they_obey_bellmans_equation() -> None:
+    rng = np.random.default_rng(5)
+    for _ in range(60):
+        size = int(rng.integers(1, 12))
+        table = rng.integers(-1, size, (size, 2))
+        distance = graphs.shortest_path_distances(table).numpy()
+        assert distance_faults(table, distance) == []
+        assert distance_faults(table, distance.astype(np.int64)) == []
+        changed = distance.copy()
+        start, goal = rng.integers(0, size, 2)
+        changed[start, goal] += rng.choice([-3, -1, 1, 2, 300])
+        (fault,) = distance_faults(table, changed)
+        wrong, right = changed[start, goal], distance[start, goal]
+        assert f"state {start} to state {goal}: {wrong}, but by the graph it is {right};" in fault
+
+
+def test_all_distances_of_one_too_many_are_noticed() -> None:
+    ring = np.array([[1], [2], [0]])
+    distance = graphs.shortest_path_distances(ring).numpy()
+    assert distance_faults(ring, distance + 1)
+    assert distance_faults(ring, np.where(distance == 0, 3, distance))  # a whole way round
 
 
 def test_paths_longer_than_int16_holds() -> None:

@@ -16,7 +16,7 @@ from PIL import Image
 
 from vusfa.errors import SceneError
 from vusfa.scenes import Scene, validate
-from vusfa.scenes.pictures import decode, read_jpegs
+from vusfa.scenes.pictures import decode, stored
 
 Make = Callable[..., Path]
 
@@ -145,7 +145,7 @@ def test_one_picture_for_many_states_is_not_multiplied(
             dataset[state] = np.zeros(10_000, np.uint8)
     monkeypatch.setattr(Path, "stat", lambda self: os.stat_result([0o100644, 0, 0, 0, 0, 0, 20_000, 0, 0, 0]))
     with pytest.raises(SceneError, match="has more bytes than the file"):
-        read_jpegs(path)
+        stored(path, 5)
 
 
 def test_pictures_of_one_color_are_read_whatever_their_size(make_file: Make) -> None:

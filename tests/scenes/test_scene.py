@@ -149,7 +149,7 @@ def test_cannot_be_changed() -> None:
         ({"rotation": [0.0, float("nan"), 0.0]}, "'rotation', state 1: nan is not finite"),
         (
             {"distance": torch.zeros(3, 3, dtype=torch.int64)},
-            r"state 0 to state 1 \(the first of 6\): 0, but",
+            r"state 0 to state 1: 0, but",
         ),
         ({"actions": ["on"]}, "'actions' names 1 actions, but dataset 'graph' has 2 columns"),
         ({"graph": torch.zeros(0, 2, dtype=torch.int64)}, r"'graph' is empty, \(0, 2\)"),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fcntl
 import io
 import threading
 from collections.abc import Callable
@@ -17,7 +18,8 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from vusfa.errors import SceneError
-from vusfa.scenes import Scene, store, validate
+from vusfa.scenes import Scene, SceneSet, store, validate
+from vusfa.sources.compact import compact
 
 
 def content(path: Path) -> dict[str, Any]:
@@ -281,7 +283,7 @@ def test_distances_that_disagree_with_the_graph(make_file: Callable[..., Path]) 
         file["shortest_path_distance"][2, 0] = -1
         file["shortest_path_distance"][4, 4] = 1
     assert the_fault(path) == (
-        "dataset 'shortest_path_distance', state 1 to state 3 (the first of 3): 7, but by the graph it is 2;"
+        "dataset 'shortest_path_distance', state 1 to state 3: 7, but by the graph it is 2;"
         " correct the graph, or replace the dataset by vusfa.scenes.graph.shortest_path_distances(graph)"
     )
 
@@ -372,6 +374,66 @@ def test_all_faults_at_once(make_file: Callable[..., Path], pictures: np.ndarray
         f"{path}: 5 faults",
         *(f"  - {fault.removeprefix(f'{path}: ')}" for fault in faults),
     ]
+
+
+def test_what_else_a_file_holds_is_kept(make_file: Callable[..., Path], tmp_path: Path) -> None:
+    path = make_file(observation_jpeg=None, attributes={"seed": 3})
+    with h5py.File(path, "a") as file:
+        file["depth"] = np.arange(15, dtype=np.float16).reshape(5, 3)
+        file["depth"].attrs["unit"] = "m"
+        file.create_group("objects")["names"] = np.array([b"bed", b"lamp"])
+        file["location"].attrs["unit"] = "m"
+        file["resnet_feature"].attrs["layer"] = "pool5"
+        file["elsewhere"] = h5py.ExternalLink("/etc/passwd", "/")
+        file.create_dataset("outside", (4,), "u1", external=[("/etc/passwd", 0, 4)])
+    Scene.load(path).save(tmp_path / "saved.h5")
+    compact(path, tmp_path / "small.h5")
+    Scene.load(path).save(path)  # in its own place
+    for copy in (tmp_path / "saved.h5", tmp_path / "small.h5", path):
+        assert validate(copy) == []
+        with h5py.File(copy) as file:
+            assert file["depth"][()].tolist() == np.arange(15).reshape(5, 3).tolist()
+            assert file["objects/names"][()].tolist() == [b"bed", b"lamp"]
+            units = [file["depth"].attrs["unit"], file["location"].attrs["unit"]]
+            assert units == ["m", "m"]
+            assert file["resnet_feature"].attrs["layer"] == "pool5"
+            assert file.get("elsewhere", getlink=True).filename == "/etc/passwd"
+            assert "outside" not in file
+
+
+def test_a_locked_file_is_called_locked(
+    make_file: Callable[..., Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = make_file()
+    monkeypatch.delenv("HDF5_USE_FILE_LOCKING", raising=False)
+    with open(path) as other:
+        fcntl.flock(other, fcntl.LOCK_EX)
+        (fault,) = validate(path)
+    assert fault.startswith(f"{path}: is locked")
+    assert "HDF5_USE_FILE_LOCKING=FALSE" in fault
+    assert validate(path) == []
+
+
+def test_a_file_that_may_not_be_read(make_file: Callable[..., Path], monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*arguments: object) -> None:
+        raise PermissionError(13, "Permission denied")
+
+    path = make_file()
+    monkeypatch.setattr("vusfa.scenes.hdf5.h5py.File", refuse)  # nothing is unreadable to root
+    assert validate(path) == [f"{path}: may not be read (Permission denied); change its permissions"]
+
+
+@pytest.mark.parametrize("kind", ["i8", "i4", "i2", "u1"])
+def test_distances_of_any_integers_are_held_in_two_bytes(make_file: Callable[..., Path], kind: str) -> None:
+    path = make_file(shortest_path_distance=None)
+    ring = np.abs(np.arange(5)[:, None] - np.arange(5))
+    ring = np.minimum(ring, 5 - ring)
+    with h5py.File(path, "a") as file:
+        file.create_dataset("shortest_path_distance", data=ring.astype(kind), chunks=(2, 3))
+    scene = Scene.load(path)
+    assert scene.distance.dtype == torch.int16
+    assert scene.distance.tolist() == ring.tolist()
+    assert SceneSet([scene]).distance_tables[0].data_ptr() == scene.distance.data_ptr()
 
 
 def test_a_group_in_a_datasets_place(make_file: Callable[..., Path]) -> None:

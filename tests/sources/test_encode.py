@@ -151,13 +151,13 @@ def test_a_scene_is_encoded_and_keeps_the_rest(room_file: Path, square: np.ndarr
 
 
 def test_in_place_and_jpegs_byte_for_byte(room_file: Path, tmp_path: Path) -> None:
-    from vusfa.scenes.pictures import read_jpegs
+    from vusfa.scenes.pictures import stored
     from vusfa.sources.compact import compact
 
     compact(room_file, tmp_path / "small.h5")
-    jpegs = read_jpegs(tmp_path / "small.h5")
+    jpegs, _ = stored(tmp_path / "small.h5", 0)
     encode_scene(tmp_path / "small.h5", tmp_path / "small.h5", SMALL)
-    assert read_jpegs(tmp_path / "small.h5") == jpegs
+    assert stored(tmp_path / "small.h5", 0)[0] == jpegs
     assert Scene.load(tmp_path / "small.h5").feature_size == 2
 
 

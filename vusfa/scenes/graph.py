@@ -1,9 +1,8 @@
-"""Structure of a scene's graph: successor table, shortest paths, components.
+"""Successor table, shortest paths and components of a scene's graph.
 
-A graph is an integer table of shape ``(N, A)``: ``graph[s, a]`` is the state that action ``a`` leads to from
-state ``s``, or -1 when the move is blocked; the agent then stays where it is, and the action counts as any.
-Everything here is a pure function of such a table (a tensor or an array) and returns tensors on the CPU. The
-success of walks on it is in :mod:`vusfa.scenes.markov`.
+A graph is an integer table (N, A), tensor or array: ``graph[s, a]`` is the state that action ``a`` leads to
+from state ``s``, or -1 when the move is blocked: the agent then stays in place, and the action counts. All
+functions are pure and return tensors on the CPU. :mod:`vusfa.scenes.markov` computes the success of policies.
 """
 
 from __future__ import annotations
@@ -31,15 +30,12 @@ __all__ = [
     "weak_components",
 ]
 
-# Searches give float64 tables: at most 32 MiB of them at a time.
-_SEARCH_ELEMENTS = 1 << 22
-
 
 def as_table(graph: Tensor | np.ndarray) -> np.ndarray:
-    """A graph as an int64 array (N, A), checked.
+    """Check a graph and return it as an int64 array (N, A).
 
     Raises:
-        ValueError: it has another shape or type, or names states that it does not have.
+        ValueError: another shape or type, or a successor that is not a state.
     """
     table = graph.detach().cpu().numpy() if isinstance(graph, Tensor) else np.asarray(graph)
     if table.ndim != 2 or table.dtype.kind not in "iu":
@@ -52,10 +48,10 @@ def as_table(graph: Tensor | np.ndarray) -> np.ndarray:
 
 
 def as_states(states: Any, num_states: int, role: str) -> np.ndarray:
-    """State ids as an int64 array (K,), checked; ``role`` says what they are in the message.
+    """Check state ids and return them as an int64 array (K,); messages call them ``role``.
 
     Raises:
-        GoalError: one is not a state of the graph.
+        GoalError: an id that is not a state.
     """
     array = states.detach().cpu().numpy() if isinstance(states, Tensor) else np.asarray(states)
     ids = np.atleast_1d(array)
@@ -68,7 +64,7 @@ def as_states(states: Any, num_states: int, role: str) -> np.ndarray:
 
 
 def _edges(table: np.ndarray) -> sparse.csr_matrix:
-    """Adjacency (N, N): entry (s, t) is set where some action leads from s to t."""
+    """Adjacency matrix (N, N)."""
     source, action = np.nonzero(table >= 0)
     target = table[source, action]
     ones = np.ones(len(source), dtype=np.float64)
@@ -76,19 +72,24 @@ def _edges(table: np.ndarray) -> sparse.csr_matrix:
 
 
 def _breadth_first(edges: sparse.csr_matrix, sources: np.ndarray) -> np.ndarray:
-    """Number of edges from each source to each state, (len(sources), N) int32, -1 where there is no path."""
+    """Number of edges from each source to each state, (len(sources), N) int16 or int32, -1 without a path."""
     num_states = edges.shape[0]
-    result = np.empty((len(sources), num_states), dtype=np.int32)
-    block = max(1, _SEARCH_ELEMENTS // max(num_states, 1))
-    for first in range(0, len(sources), block):
-        rows = slice(first, first + block)
-        found = csgraph.dijkstra(edges, indices=sources[rows], unweighted=True)
-        result[rows] = np.where(np.isinf(found), -1, found)
+    result = np.full((len(sources), num_states), -1, np.int16 if num_states <= 1 << 15 else np.int32)
+    position = np.empty(num_states, np.int32)
+    for row, source in enumerate(sources.tolist()):
+        order, predecessor = csgraph.breadth_first_order(edges, source)
+        position[order] = np.arange(len(order), dtype=np.int32)
+        ancestor = position[np.append(source, predecessor[order[1:]])]
+        depth = np.minimum(np.arange(len(order)), 1)
+        while ancestor.any():  # at every turn twice as many generations
+            depth += depth[ancestor]
+            ancestor = ancestor[ancestor]
+        result[row, order] = depth
     return result
 
 
 def default_actions(num_actions: int) -> tuple[str, ...]:
-    """Default names of actions: those of the THOR v1 dumps when there are four, numbers for any other count.
+    """Default names of actions: those of the THOR v1 dumps for four, numbers for any other count.
 
     >>> default_actions(4)
     ('MoveForward', 'RotateRight', 'RotateLeft', 'MoveBackward')
@@ -101,7 +102,7 @@ def default_actions(num_actions: int) -> tuple[str, ...]:
 
 
 def successor_table(graph: Tensor | np.ndarray) -> tuple[Tensor, Tensor]:
-    """Where each action leads, blocked moves staying in place, and which moves are blocked.
+    """Successor of every state and action, the state itself for blocked moves.
 
     Args:
         graph: (N, A) integers, -1 = blocked.
@@ -119,45 +120,47 @@ def successor_table(graph: Tensor | np.ndarray) -> tuple[Tensor, Tensor]:
     return torch.from_numpy(successor), torch.from_numpy(blocked)
 
 
-def shortest_path_distances(graph: Tensor | np.ndarray) -> Tensor:
-    """Fewest actions from every state to every other, by breadth-first search.
+def shortest_path_distances(graph: Tensor | np.ndarray, sources: Any = None) -> Tensor:
+    """Lengths of all shortest paths, by breadth-first search.
 
     Args:
         graph: (N, A) integers, -1 = blocked.
+        sources: (K,) states to start from; all of them when None.
 
     Returns:
-        (N, N), ``[s, g]`` in actions, 0 on the diagonal and -1 where g cannot be reached from s; int16, or
-        int32 where a path is longer than that holds.
+        (K, N), ``[s, g]`` in actions, 0 where g is s, -1 where g cannot be reached from s; int16, or int32
+        where a path is too long for it.
 
     >>> shortest_path_distances(torch.tensor([[1, -1], [2, -1], [-1, -1]])).tolist()
     [[0, 1, 2], [-1, 0, 1], [-1, -1, 0]]
     """
     table = as_table(graph)
-    return narrow_distances(_breadth_first(_edges(table), np.arange(len(table))))
+    starts = np.arange(len(table)) if sources is None else as_states(sources, len(table), "source")
+    return narrow_distances(_breadth_first(_edges(table), starts))
 
 
 def narrow_distances(distance: np.ndarray) -> Tensor:
-    """A table of distances as int16, or as int32 where one is longer than that holds; always a copy.
+    """Distances as int16, or as int32 where one is too long for it; a copy unless they are that already.
 
     >>> narrow_distances(np.array([[0, 32767]])).dtype, narrow_distances(np.array([[0, 32768]])).dtype
     (torch.int16, torch.int32)
     """
     fits = not distance.size or distance.max() <= np.iinfo(np.int16).max
-    return torch.from_numpy(distance.astype(np.int16 if fits else np.int32))
+    return torch.from_numpy(distance.astype(np.int16 if fits else np.int32, copy=False))
 
 
 def steps_to_goals(graph: Tensor | np.ndarray, goals: Any) -> Tensor:
-    """Fewest actions from every state to some goals: a search backwards, cheap when the goals are few.
+    """Lengths of the shortest paths from every state to some goals, by breadth-first search backwards.
 
     Args:
         graph: (N, A) integers, -1 = blocked.
-        goals: one state id, or (G,) of them.
+        goals: one state id, or (G,).
 
     Returns:
         (G, N) int64, -1 where the goal cannot be reached from the state.
 
     Raises:
-        GoalError: a goal is not a state.
+        GoalError: a goal that is not a state.
 
     >>> steps_to_goals(torch.tensor([[1, -1], [2, -1], [-1, -1]]), [2, 0]).tolist()
     [[2, 1, 0], [0, -1, -1]]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import mmap
 import uuid
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -16,7 +16,7 @@ import numpy as np
 from vusfa import limits
 from vusfa.errors import SceneError
 
-__all__ = ["check_heaps", "dataset_in", "opened", "plain", "replaced"]
+__all__ = ["check_heaps", "copy_others", "dataset_in", "opened", "plain", "read_distances", "replaced"]
 
 
 @contextmanager
@@ -24,7 +24,7 @@ def opened(path: Path) -> Iterator[h5py.File]:
     """A file open for reading within a ``with`` block.
 
     Raises:
-        SceneError: the file is missing, truncated or damaged, or is no HDF5 file.
+        SceneError: the file is missing, locked, unreadable, truncated, damaged, or no HDF5 file.
     """
     if not path.exists() or path.is_dir():
         raise SceneError(f"{path}: there is no such file; check the path")
@@ -33,8 +33,17 @@ def opened(path: Path) -> Iterator[h5py.File]:
     try:
         with h5py.File(path, "r") as file:
             yield file
+    except PermissionError as error:
+        raise SceneError(f"{path}: may not be read ({error.strerror}); change its permissions") from error
     # What HDF5 meets in a damaged file comes as any of these.
-    except (OSError, RuntimeError, KeyError) as error:
+    except (OSError, RuntimeError, KeyError, ValueError) as error:
+        if isinstance(error, SceneError):
+            raise
+        if isinstance(error, BlockingIOError) or "unable to lock" in str(error):
+            raise SceneError(
+                f"{path}: is locked, or its disk knows no locks; close the program that writes it, or set the"
+                f" environment variable HDF5_USE_FILE_LOCKING=FALSE if none does"
+            ) from error
         raise SceneError(
             f"{path}: cannot be read as HDF5 ({error}); the file is truncated, damaged or something else:"
             f" copy it or make it again"
@@ -107,6 +116,59 @@ def dataset_in(file: h5py.File, name: str) -> h5py.Dataset | None:
     if fault is not None:
         raise OSError(fault)
     return found
+
+
+def read_distances(dataset: h5py.Dataset) -> np.ndarray:
+    """A table of distances (N, N), in int16 where that holds every possible one; larger values are clipped.
+
+    Some rows are read at a time: other programs write 8 bytes per distance.
+    """
+    square = dataset.ndim == 2 and dataset.shape[0] == dataset.shape[1] > 0
+    if not square or dataset.dtype.kind not in "iu" or dataset.dtype == np.int16:
+        return np.asarray(dataset[()])
+    table = np.empty(dataset.shape, np.int16)  # of at most limits.MAX_STATES states
+    rows = dataset.chunks[0] if dataset.chunks else 1
+    rows *= max(1, (1 << 22) // (rows * dataset.shape[1]))
+    for first in range(0, len(table), rows):
+        table[first : first + rows] = np.clip(dataset[first : first + rows], -2, np.iinfo(np.int16).max)
+    return table
+
+
+def copy_others(source: Path, target: h5py.File, known: Collection[str], stale: Collection[str] = ()) -> None:
+    """Copy what a file holds besides the content of a scene.
+
+    Unknown datasets, groups and links are copied as they lie there, save datasets whose data lie in another
+    file; of known datasets the attributes.
+
+    Args:
+        source: the file.
+        target: an open file with its own datasets.
+        known: names of datasets of a scene.
+        stale: datasets with new content, whose attributes are not copied.
+
+    Raises:
+        SceneError: something cannot be copied.
+    """
+    with opened(source) as file:
+        for name in file:
+            link = file.get(name, getlink=True)
+            if not isinstance(link, h5py.HardLink):
+                if name not in known:
+                    target[name] = link
+                continue
+            found = file[name]
+            if name in known:
+                if name in target and name not in stale:
+                    _copy_attributes(found, target[name])
+            elif not (isinstance(found, h5py.Dataset) and (found.external or found.is_virtual)):
+                file.copy(name, target)
+
+
+def _copy_attributes(source: h5py.Dataset, target: h5py.Dataset) -> None:
+    for key in source.attrs:
+        kind = source.attrs.get_id(key).dtype
+        if (key not in target.attrs and kind.kind != "O") or h5py.check_string_dtype(kind):
+            target.attrs.create(key, source.attrs[key], dtype=kind)
 
 
 def size_fault(dataset: h5py.Dataset) -> str | None:

@@ -28,20 +28,21 @@ __all__ = [
     "open_image",
     "picture_faults",
     "raw_blocks",
-    "read_jpegs",
     "read_pictures",
+    "stored",
     "to_jpeg",
     "write_jpegs",
     "write_raw",
 ]
 
-_RAW, _JPEG = "observation", "observation_jpeg"
+#: Names of the datasets of pictures.
+DATASETS = _RAW, _JPEG = "observation", "observation_jpeg"
 _AT_ONCE = 32
 _QUALITY = 92
 
 
 def _find(file: h5py.File) -> tuple[str, h5py.Dataset] | None:
-    for name in (_RAW, _JPEG):
+    for name in DATASETS:
         dataset = dataset_in(file, name)
         if dataset is not None:
             return name, dataset
@@ -180,20 +181,23 @@ def picture_faults(path: Path, num_states: int) -> list[str]:
     return []
 
 
-def read_jpegs(path: Path) -> list[bytes] | None:
-    """The JPEG files of all states as they lie there; None when the pictures are raw."""
+def stored(path: Path, num_states: int) -> tuple[list[bytes] | None, Iterator[np.ndarray] | None]:
+    """The pictures of a file as they are stored: JPEG files or blocks of raw ones, None for the others."""
     with opened(path) as file:
         found = _find(file)
-        if found is None or found[0] != _JPEG:
-            return None
+        if found is None:
+            return None, None
+        name, dataset = found
+        if name == _RAW:
+            return None, raw_blocks(path, num_states)
         jpegs: list[bytes] = []
         left = path.stat().st_size
-        for state in range(len(found[1])):
-            jpegs.append(found[1][state].tobytes())
+        for state in range(len(dataset)):
+            jpegs.append(dataset[state].tobytes())
             left -= len(jpegs[-1])
             if left < 0:
                 raise SceneError(f"{path}: dataset {_JPEG!r} has more bytes than the file; write it again")
-        return jpegs
+        return jpegs, None
 
 
 def write_jpegs(file: h5py.File, jpegs: Sequence[bytes]) -> None:

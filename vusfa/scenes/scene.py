@@ -1,8 +1,7 @@
 """One scene: a room as a finite graph of photographed poses.
 
 A state is a pose (a place and a heading) with its picture's features; an action leads to another state or is
-blocked. No file stays open: a scene can be pickled, forked and spawned. Pictures are read from the file when
-they are asked for.
+blocked. No file stays open: a scene can be pickled, forked and spawned, and pictures are read when asked for.
 """
 
 from __future__ import annotations
@@ -22,7 +21,7 @@ from vusfa.errors import SceneError
 from vusfa.scenes import store
 from vusfa.scenes.graph import default_actions, narrow_distances, shortest_path_distances, weak_components
 from vusfa.scenes.pictures import read_pictures
-from vusfa.scenes.validation import DATASETS, array_faults, raise_faults
+from vusfa.scenes.validation import array_faults, raise_faults
 
 __all__ = ["Scene"]
 
@@ -31,23 +30,21 @@ __all__ = ["Scene"]
 class Scene:
     """A room: its graph, its pictures' features, its poses. All tensors are on the CPU.
 
-    Built from tensors or arrays, which are checked and copied; or read by :meth:`load` and :meth:`bundled`.
-
     Args:
-        name: what the scene is called.
+        name: the scene's name.
         graph: (N, A) integers, next state, -1 = blocked.
         features: (N, C, F) floats, C crops (augmented views) of F features; kept as float32.
         location: (N, 2) metres; zeros when not given.
         rotation: (N,) degrees; zeros when not given.
-        distance: (N, N) integers, ``[s, g]`` actions from s to g, -1 = unreachable; computed when not
-            given, and checked against a breadth-first search when given.
-        actions: A names; the THOR v1 dumps' four when not given and A is 4.
+        distance: (N, N) integers, ``[s, g]`` actions from s to g, -1 = unreachable; computed when not given,
+            else checked against the graph.
+        actions: A names; those of the THOR v1 dumps when not given and A is 4.
         attributes: provenance: str, int, float, or lists of these.
         path: the file that pictures are read from; None for a scene in memory.
         picture_shape: (H, W, 3) of the pictures in that file; None without pictures.
 
     Raises:
-        SceneError: something does not fit; the message lists every fault.
+        SceneError: arguments that do not fit; the message lists every fault.
 
     >>> corridor = Scene("corridor", torch.tensor([[1, -1], [2, 0], [-1, 1]]), torch.rand(3, 1, 8))
     >>> corridor.distance.tolist()
@@ -70,32 +67,42 @@ class Scene:
     picture_shape: tuple[int, int, int] | None = None
 
     def __post_init__(self) -> None:
-        arrays = {"graph": _numpy(self.graph), "resnet_feature": _numpy(self.features)}
+        given = {
+            "graph": self.graph,
+            "resnet_feature": self.features,
+            "location": self.location,
+            "rotation": self.rotation,
+            "shortest_path_distance": self.distance,
+        }
+        arrays = {
+            key: np.array(value.detach().cpu().numpy() if isinstance(value, Tensor) else value)
+            for key, value in given.items()
+            if value is not None
+        }
         num_states = len(arrays["graph"]) if arrays["graph"].ndim else 0
-        arrays["location"] = np.zeros((num_states, 2)) if self.location is None else _numpy(self.location)
-        arrays["rotation"] = np.zeros(num_states) if self.rotation is None else _numpy(self.rotation)
-        if self.distance is not None:
-            arrays["shortest_path_distance"] = _numpy(self.distance)
+        arrays.setdefault("location", np.zeros((num_states, 2)))
+        arrays.setdefault("rotation", np.zeros(num_states))
         actions = None if self.actions is None else tuple(self.actions)
         source = f"scene {self.name!r}" if self.path is None else self.path
         raise_faults(source, array_faults(arrays, actions, optional=["shortest_path_distance"]))
-        if self.distance is None:
-            distance = shortest_path_distances(arrays["graph"])
-        else:
-            # These were found equal to a search of the graph just now: no need for another.
-            distance = narrow_distances(arrays["shortest_path_distance"])
-        checked = {
+        if "shortest_path_distance" not in arrays:
+            arrays["shortest_path_distance"] = shortest_path_distances(arrays["graph"]).numpy()
+        self._set(arrays, actions)
+
+    def _set(self, arrays: dict[str, np.ndarray], actions: tuple[str, ...] | None) -> None:
+        """Set the fields from arrays that are sound, and are the scene's own from now on."""
+        values = {
             "graph": _tensor(arrays["graph"], np.int64),
             "features": _tensor(arrays["resnet_feature"], np.float32),
             "location": _tensor(arrays["location"], np.float32),
             "rotation": _tensor(arrays["rotation"], np.float32),
-            "distance": distance,
+            "distance": narrow_distances(arrays["shortest_path_distance"]),
             "actions": actions or default_actions(arrays["graph"].shape[1]),
             "attributes": dict(self.attributes),
             # Workers may run in another folder.
             "path": None if self.path is None else Path(self.path).resolve(),
         }
-        for key, value in checked.items():
+        for key, value in values.items():
             object.__setattr__(self, key, value)
 
     @classmethod
@@ -106,20 +113,13 @@ class Scene:
             SceneError: the file is missing, truncated or has faults; the message lists every one of them.
         """
         dump = store.read(path)
-        if dump.reading_faults or len(dump.arrays) < len(DATASETS):
-            raise_faults(path, dump.faults())
-        # The values are checked there, once.
-        fields: dict[str, Any] = {
-            "graph": dump.arrays["graph"],
-            "features": dump.arrays["resnet_feature"],
-            "location": dump.arrays["location"],
-            "rotation": dump.arrays["rotation"],
-            "distance": dump.arrays["shortest_path_distance"],
-            "actions": dump.actions,
-        }
-        return cls(
-            dump.name, **fields, attributes=dump.attributes, path=Path(path), picture_shape=dump.picture_shape
-        )
+        raise_faults(path, dump.faults())
+        scene = object.__new__(cls)
+        fields = {"attributes": dump.attributes, "path": Path(path), "picture_shape": dump.picture_shape}
+        for key, value in {"name": dump.name, **fields}.items():
+            object.__setattr__(scene, key, value)
+        scene._set(dump.arrays, dump.actions)  # without another copy, and without looking at them again
+        return scene
 
     @classmethod
     def bundled(cls, name: str) -> Scene:
@@ -157,16 +157,17 @@ class Scene:
     ) -> None:
         """Write the scene, atomically; what is read back is equal, number for number.
 
+        What else the scene's own file holds (further datasets, attributes of datasets) is copied along.
+
         Args:
-            path: where to; replaced if it exists.
-            pictures: (N, H, W, 3) uint8, or N JPEG files as bytes; None copies those of the scene's file
-                as they are.
+            path: file to write; replaced if it exists.
+            pictures: (N, H, W, 3) uint8, or N JPEG files as bytes; None copies those of the scene's file as
+                they are.
 
         Raises:
             SceneError: the pictures do not fit, an attribute cannot be written, or the folder does not exist.
         """
-        if isinstance(pictures, Tensor):
-            pictures = pictures.cpu().numpy()
+        in_file = self.path is not None and (self.has_pictures or self.path.is_file())
         store.write(
             path,
             {
@@ -179,11 +180,12 @@ class Scene:
             name=self.name,
             actions=self.actions,
             attributes=self.attributes,
-            pictures=self.path if pictures is None and self.has_pictures else pictures,
+            pictures=pictures.cpu().numpy() if isinstance(pictures, Tensor) else pictures,
+            source=self.path if in_file else None,
         )
 
     def pictures(self, ids: Any) -> Tensor:
-        """Pictures of some states, read from the scene's file now; the file is closed again.
+        """Pictures of some states, read from the scene's file now.
 
         Args:
             ids: state ids of any shape, in any order, repeats allowed.
@@ -237,10 +239,5 @@ class Scene:
         return weak_components(self.graph)[1:]
 
 
-def _numpy(values: Any) -> np.ndarray:
-    return values.detach().cpu().numpy() if isinstance(values, Tensor) else np.asarray(values)
-
-
 def _tensor(values: np.ndarray, dtype: Any) -> Tensor:
-    """A copy, so that nobody else can change it."""
-    return torch.from_numpy(np.array(values, dtype=dtype))
+    return torch.from_numpy(np.ascontiguousarray(values, dtype=dtype))

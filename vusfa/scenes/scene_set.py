@@ -293,7 +293,8 @@ class SceneSet:
 
 
 def _joined(arrays: list[np.ndarray]) -> Tensor:
-    return torch.from_numpy(np.concatenate(arrays))
+    """All arrays in one; a single one is shared, not copied."""
+    return torch.from_numpy(np.concatenate(arrays) if len(arrays) > 1 else arrays[0])
 
 
 def _listed(scenes: Any) -> list[Any]:

@@ -15,7 +15,7 @@ actions. Every function opens the file, does its work and closes it, so that sce
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -26,7 +26,7 @@ import numpy as np
 from vusfa.deprecated import moved_names
 from vusfa.errors import SceneError
 from vusfa.scenes import pictures as picture_files
-from vusfa.scenes.hdf5 import check_heaps, dataset_in, opened, plain, replaced
+from vusfa.scenes.hdf5 import check_heaps, copy_others, dataset_in, opened, plain, read_distances, replaced
 from vusfa.scenes.validation import DATASETS, array_faults
 
 __all__ = ["Dump", "bundled_names", "bundled_path", "read", "validate", "write"]
@@ -104,8 +104,9 @@ def read(path: str | os.PathLike[str]) -> Dump:
             try:
                 dataset = dataset_in(file, name)
                 if dataset is not None:
-                    dump.arrays[name] = np.asarray(dataset[()])
-            except (OSError, RuntimeError) as error:
+                    distances = name == "shortest_path_distance"
+                    dump.arrays[name] = read_distances(dataset) if distances else np.asarray(dataset[()])
+            except (OSError, RuntimeError, TypeError, ValueError) as error:
                 dump.reading_faults.append(
                     f"dataset {name!r} cannot be read ({error}); copy the file or make it again"
                 )
@@ -172,7 +173,9 @@ def write(
     name: str,
     actions: Sequence[str],
     attributes: Mapping[str, Any],
-    pictures: np.ndarray | Sequence[bytes] | Path | None = None,
+    pictures: np.ndarray | Sequence[bytes] | None = None,
+    source: Path | None = None,
+    stale: Collection[str] = (),
 ) -> None:
     """Write a scene file, atomically.
 
@@ -180,12 +183,15 @@ def write(
     Everything but the JPEG files is compressed and carries checksums. The same content gives the same bytes.
 
     Args:
-        path: where to; replaced if it exists.
+        path: file to write; replaced if it exists.
         arrays: the datasets of :data:`vusfa.scenes.validation.DATASETS`.
         name: the scene's name.
         actions: A names.
         attributes: provenance.
-        pictures: (N, H, W, 3) uint8, or N JPEG files, or a scene file to copy them from as they are, or None.
+        pictures: (N, H, W, 3) uint8, or N JPEG files; None copies those of ``source`` as they are.
+        source: the scene's file so far. What else it holds is copied, see
+            :func:`vusfa.scenes.hdf5.copy_others`.
+        stale: datasets with new content, whose attributes in ``source`` are not copied.
 
     Raises:
         SceneError: the file cannot be written, an attribute has no place in it, or the pictures do not fit.
@@ -195,24 +201,17 @@ def write(
     packed = {key: _smallest_integer(arrays[key]) for key in ("graph", "shortest_path_distance")}
     packed["resnet_feature"] = _smallest_float(arrays["resnet_feature"])
     packed |= {key: np.asarray(arrays[key], dtype=np.float32) for key in ("location", "rotation")}
-    jpegs: Sequence[bytes] | None = None
     raw: Iterable[np.ndarray] | None = None
-    if isinstance(pictures, Path):
-        jpegs = picture_files.read_jpegs(pictures)
-        raw = picture_files.raw_blocks(pictures, num_states) if jpegs is None else None
-    elif isinstance(pictures, np.ndarray):
+    if pictures is None and source is not None:
+        pictures, raw = picture_files.stored(source, num_states)
+    if isinstance(pictures, np.ndarray):
         raw = [pictures]
-    elif pictures is not None:
-        jpegs = list(pictures)
-    supplied = pictures if isinstance(pictures, np.ndarray) else jpegs
-    if supplied is not None and len(supplied) != num_states:
-        raise SceneError(f"{path}: {len(supplied)} pictures for {num_states} states; give one for each")
-    if isinstance(supplied, np.ndarray) and (
-        supplied.dtype != np.uint8 or supplied.ndim != 4 or supplied.shape[3] != 3
-    ):
-        raise SceneError(
-            f"{path}: pictures are {supplied.dtype} of shape {supplied.shape}; give uint8 (N, H, W, 3)"
-        )
+        if pictures.dtype != np.uint8 or pictures.ndim != 4 or pictures.shape[3] != 3:
+            raise SceneError(
+                f"{path}: pictures are {pictures.dtype} of shape {pictures.shape}; give uint8 (N, H, W, 3)"
+            )
+    if pictures is not None and len(pictures) != num_states:
+        raise SceneError(f"{path}: {len(pictures)} pictures for {num_states} states; give one for each")
     with replaced(path) as file:
         _write_attributes(file, {**attributes, "scene": name, "actions": list(actions)})
         for key in DATASETS:
@@ -221,8 +220,10 @@ def write(
             )
         if raw is not None:
             picture_files.write_raw(file, raw, num_states)
-        if jpegs is not None:
-            picture_files.write_jpegs(file, jpegs)
+        elif pictures is not None:
+            picture_files.write_jpegs(file, list(pictures))
+        if source is not None:
+            copy_others(source, file, {*DATASETS, *picture_files.DATASETS}, stale)
 
 
 __getattr__ = moved_names(__name__, {"compact": "vusfa.sources.compact.compact"})

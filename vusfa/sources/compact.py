@@ -38,12 +38,9 @@ def compact(source: str | os.PathLike[str], target: str | os.PathLike[str]) -> N
             f" +-65504; scale the features down"
         )
     num_states, num_actions = dump.arrays["graph"].shape
-    pictures: Path | list[bytes] | None = None
-    if dump.picture_shape is not None:
-        pictures = source
-        if picture_files.read_jpegs(source) is None:
-            blocks = picture_files.raw_blocks(source, num_states)
-            pictures = [picture_files.to_jpeg(picture) for block in blocks for picture in block]
+    pictures, blocks = picture_files.stored(source, num_states)
+    if blocks is not None:
+        pictures = [picture_files.to_jpeg(picture) for block in blocks for picture in block]
     store.write(
         target,
         {**dump.arrays, "resnet_feature": half.astype(np.float32)},
@@ -51,4 +48,5 @@ def compact(source: str | os.PathLike[str], target: str | os.PathLike[str]) -> N
         actions=dump.actions or default_actions(num_actions),
         attributes=dump.attributes,
         pictures=pictures,
+        source=source,
     )

@@ -207,7 +207,8 @@ def encode_scene(
         name=dump.name,
         actions=dump.actions or default_actions(num_actions),
         attributes={**dump.attributes, **attributes},
-        pictures=source,
+        source=source,
+        stale=["resnet_feature"],
     )
     log.remove()
     return Scene.load(target)
