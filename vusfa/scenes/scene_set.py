@@ -90,8 +90,7 @@ class SceneSet:
     def open(cls, scenes: str | os.PathLike[str] | Sequence[str | os.PathLike[str]]) -> SceneSet:
         """Bundled names and files alike: ``SceneSet.open(["bathroom", "my_room.h5"])``.
 
-        Each is opened by :meth:`Scene.open`. Scenes of the same name, such as rooms of one kind rendered from
-        several seeds, are renamed after their files, without suffix.
+        Scenes of one name, such as rooms of one kind from several seeds, are renamed after their files.
 
         Raises:
             SceneError: neither a bundled name nor a file, or a file with faults.
@@ -151,8 +150,8 @@ class SceneSet:
     def distance_tables(self) -> tuple[Tensor, Tensor]:
         """The scenes' N x N tables of shortest paths, row by row, one after the other, for frequent use.
 
-        Entry ``first[i] + s * N + g`` of the first tensor is the actions from s to g, in scene i's own ids.
-        The second tensor is ``first``, (n_scenes + 1,). Shared with the set, not copied.
+        Entry ``first[i] + s * N + g`` of the first tensor is the actions from s to g, in scene i's own ids;
+        the second tensor is ``first``, (n_scenes + 1,). Shared, not copied.
         """
         return self._distance, self._distance_start
 
@@ -264,7 +263,7 @@ class SceneSet:
 
     @property
     def fingerprint(self) -> str:
-        """Sixteen hexadecimal digits that change with any name, graph or feature; the same on every machine.
+        """16 hexadecimal digits that change with any name, graph or feature; the same on every machine.
 
         >>> SceneSet.bundled(["bathroom"]).fingerprint == SceneSet.open("bathroom").fingerprint
         True
