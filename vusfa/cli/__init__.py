@@ -29,7 +29,7 @@ COMMANDS = [
 ]
 
 #: Modules that add a command to ``vusfa`` itself, with a function ``register(app)``.
-TRAINING_COMMANDS = ["vusfa.cli.train", "vusfa.cli.deploy"]
+TRAINING_COMMANDS = ["vusfa.cli.train", "vusfa.cli.deploy", "vusfa.cli.pretrained"]
 
 
 #: Commands beside ``vusfa scenes``: name, help, and the functions that they run.

@@ -58,6 +58,7 @@ __all__ = [
     "load_weights",
     "rebuild_agent",
     "save_checkpoint",
+    "saved_agent",
 ]
 
 FORMAT = 2
@@ -221,15 +222,20 @@ def load_agent(
                 f"{error}; if the scenes of {path} have moved, put them beside it or give them as scenes"
             ) from error
     scenes = scenes.to(device)
+    return saved_agent(path, state, scenes), scenes, state
+
+
+def saved_agent(path: str | Path, state: Mapping[str, Any], scenes: SceneSet) -> Agent:
+    """The agent of a checkpoint's content, in evaluation mode; errors of :func:`load_agent`."""
     check_scenes(path, state["scenes"], scenes)
     try:
-        agent = rebuild_agent(state["agent_config"], scenes).to(device)
+        agent = rebuild_agent(state["agent_config"], scenes).to(scenes.device)
     except VusfaError as error:
         raise CheckpointError(f"{path}: {error}") from error
     except (TypeError, ValueError, KeyError, AttributeError, IndexError, RuntimeError) as error:
         raise mended(path, f"no agent can be made of its entry 'agent_config' ({error})") from error
     load_weights(agent, state, path)
-    return agent.eval(), scenes, state
+    return agent.eval()
 
 
 def load_weights(agent: Agent, state: Mapping[str, Any], path: str | Path) -> None:

@@ -22,7 +22,7 @@ from torch import Tensor
 
 from vusfa.errors import CheckpointError, VusfaError
 
-__all__ = ["ENTRIES", "check_entries", "check_like", "mended", "read_content", "restore"]
+__all__ = ["ENTRIES", "check_entries", "check_like", "check_sizes", "mended", "read_content", "restore"]
 
 #: Entries of a checkpoint and their types; :mod:`vusfa.training.checkpoint` says what they are.
 ENTRIES: dict[str, type | tuple[type, ...]] = {
@@ -165,13 +165,20 @@ def check_entries(path: str | Path, state: Mapping[str, Any]) -> None:
     goals = state["goals"]
     if goals.dtype != torch.int64 or goals.ndim != 1 or not len(goals):
         raise mended(path, f"its entry 'goals' is {_shown(goals)}, not a list of state ids")
-    weights = state["agent"]
-    for name, value in weights.items():
+    for name, value in state["agent"].items():
         if not isinstance(value, Tensor):
             raise mended(path, f"its entry 'agent.{name}' is {_shown(value)}, not a tensor")
-    # a file of a few bytes shall not ask for layers of gigabytes
+    check_sizes(path, state["agent_config"], state["agent"])
+
+
+def check_sizes(path: str | Path, config: Mapping[str, Any], weights: Mapping[str, Tensor]) -> None:
+    """Check that a file of a few bytes does not ask for layers of gigabytes.
+
+    Raises:
+        CheckpointError: naming the setting of the agent.
+    """
     largest = max([MAX_LAYER, *(length for value in weights.values() for length in value.shape)])
-    for name, value in state["agent_config"].items():
+    for name, value in config.items():
         for number in value if isinstance(value, list) else [value]:
             if isinstance(number, int) and name not in ("scenes", "fingerprint") and abs(number) > largest:
                 raise mended(path, f"its entry 'agent_config.{name}' is {_shown(value)}")
