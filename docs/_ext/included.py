@@ -1,7 +1,7 @@
 """Files that a page includes: a line that is nothing but a link to one becomes the file's text.
 
-On a plain view of the Markdown, as on GitHub, it stays the link. This holds for the tables in docs/generated
-and for the Markdown files beside docs, whose links are then those of a page in docs.
+On a plain view of the Markdown, as on GitHub, it stays the link. This holds for the tables in docs/generated,
+for the examples, and for the Markdown files beside docs, whose links are then those of a page in docs.
 """
 
 from __future__ import annotations
@@ -14,7 +14,9 @@ from sphinx.application import Sphinx
 
 __all__ = ["include_files", "setup"]
 
-_LINK = re.compile(r"^\[[^\]\n]+\]\((generated/[\w-]+\.md|\.\./[A-Z]+\.md)\)$", flags=re.MULTILINE)
+_LINK = re.compile(
+    r"^\[[^\]\n]+\]\((generated/[\w-]+\.md|\.\./[A-Z]+\.md|\.\./examples/[\w/]+\.py)\)$", flags=re.MULTILINE
+)
 _BESIDE = re.compile(r"\]\(([A-Z]+)\.md\)")
 
 
@@ -25,6 +27,8 @@ def include_files(app: Sphinx, page: str, source: list[str]) -> None:
         path = Path(app.srcdir, link[1]).resolve()
         app.env.note_dependency(str(path))
         found = path.read_text(encoding="utf-8").replace("](docs/", "](")
+        if link[1].endswith(".py"):
+            return f"```python\n{found}```"
         if link[1].startswith("generated/"):
             return f":::{{div}} numbers\n{found}\n:::"
         return _BESIDE.sub(lambda name: f"]({name[1].lower()}.md)", found)

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 
 import matplotlib
+import matplotlib.pyplot as plt
 import pytest
 import torch
 
@@ -14,10 +16,12 @@ TUTORIALS = sorted(path for path in (DOCS / "tutorials").glob("*.md") if path.na
 
 
 @pytest.fixture(autouse=True)
-def elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """What a tutorial writes goes to a folder of its own; figures go nowhere."""
     monkeypatch.chdir(tmp_path)
     matplotlib.use("Agg")
+    yield
+    plt.close("all")
 
 
 @pytest.mark.parametrize("path", TUTORIALS, ids=lambda path: path.stem)
