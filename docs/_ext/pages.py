@@ -35,7 +35,7 @@ def commands(folder: Path) -> list[list[str]]:
     title = ["--title", "Table 1 and hindsight"]
     return [
         [*vusfa, "report", *RESULTS, "--seeds", "1", *title, "--out", str(folder / "results.html")],
-        [*vusfa, "train", *TRAINING.split(), f"folder={run}"],
+        [*vusfa, "train", *TRAINING.split(), f"folder={run}", "overwrite=true"],
         [
             *vusfa,
             "report",
