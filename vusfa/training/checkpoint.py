@@ -239,11 +239,7 @@ def saved_agent(path: str | Path, state: Mapping[str, Any], scenes: SceneSet) ->
 
 
 def load_weights(agent: Agent, state: Mapping[str, Any], path: str | Path) -> None:
-    """Put a checkpoint's weights into an agent.
-
-    Raises:
-        CheckpointError: they are of another model.
-    """
+    """Put a checkpoint's weights into an agent; those of another model raise a CheckpointError."""
     try:
         check_like(path, "agent", state["agent"], agent.state_dict())
     except CheckpointError as error:

@@ -143,11 +143,7 @@ class _Copy:
 
 
 def check_entries(path: str | Path, state: Mapping[str, Any]) -> None:
-    """Check that a checkpoint of this version has its entries, with their types.
-
-    Raises:
-        CheckpointError: naming the entry.
-    """
+    """Check entries and types of a checkpoint of this version; a CheckpointError names the faulty one."""
     _check_types(path, "", state, ENTRIES)
     _check_types(path, "scenes.", state["scenes"], _SCENES)
     _check_types(path, "config.", state["config"], _CONFIG)
@@ -172,11 +168,7 @@ def check_entries(path: str | Path, state: Mapping[str, Any]) -> None:
 
 
 def check_sizes(path: str | Path, config: Mapping[str, Any], weights: Mapping[str, Tensor]) -> None:
-    """Check that a file of a few bytes does not ask for layers of gigabytes.
-
-    Raises:
-        CheckpointError: naming the setting of the agent.
-    """
+    """Refuse with a CheckpointError a file of a few bytes that asks for layers of gigabytes."""
     largest = max([MAX_LAYER, *(length for value in weights.values() for length in value.shape)])
     for name, value in config.items():
         for number in value if isinstance(value, list) else [value]:
