@@ -59,7 +59,7 @@ def trainer_of(scene_file: Path) -> Callable[..., Trainer]:
 
 
 def test_an_unknown_name_is_refused():
-    with pytest.raises(ConfigError, match="'hindsite' is not registered; did you mean 'hindsight'"):
+    with pytest.raises(ConfigError, match=r"'hindsite' is registered by no module.*mean 'hindsight'"):
         make_algorithm("hindsite", None, None, {})  # type: ignore[arg-type]
 
 
@@ -119,7 +119,9 @@ def test_terms_are_added_to_the_papers(trainer_of: Callable[..., Trainer]):
     with trainer.collecting() as batches:
         _, terms = trainer.update(batches)
     torch.testing.assert_close(terms["loss_second"] * 2, terms["loss_reward"])
-    with pytest.raises(ConfigError, match=r"objective\.terms\.secnd: no such term.*did you mean"):
+    with pytest.raises(
+        ConfigError, match=r"objective\.terms\.secnd is registered by no module.*did you mean"
+    ):
         trainer_of("+objective.terms.secnd=1")
 
 

@@ -5,14 +5,14 @@ Importing modules fills both tables: nothing is imported because a setting or a 
 
 from __future__ import annotations
 
-import difflib
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, TypeVar
 
 from torchrl.objectives import LossModule
 
 from vusfa.algorithms.base import Algorithm
 from vusfa.conf import settings
+from vusfa.conf.schema import near
 from vusfa.errors import ConfigError
 from vusfa.modules import Agent
 from vusfa.scenes import SceneSet
@@ -52,10 +52,12 @@ def make_algorithm(name: str, agent: Agent, scenes: SceneSet, all_settings: Mapp
     >>> make_algorithm("uzf", None, None, {})
     Traceback (most recent call last):
     ...
-    vusfa.errors.ConfigError: algorithm 'uzf' is not registered; did you mean 'usf'?
+    vusfa.errors.ConfigError: algorithm 'uzf' is registered by no module imported so far; did you mean 'usf'?
     """
     if name not in ALGORITHMS:
-        raise ConfigError(f"algorithm {name!r} is not registered; {_near(name, ALGORITHMS)}")
+        raise ConfigError(
+            f"algorithm {name!r} is registered by no module imported so far{near(name, ALGORITHMS)}"
+        )
     return ALGORITHMS[name](agent, scenes, all_settings)
 
 
@@ -82,7 +84,7 @@ def make_loss_terms(agent: Agent, coefficients: Mapping[str, float]) -> list[Los
     for name, coefficient in coefficients.items():
         if name not in LOSS_TERMS:
             raise ConfigError(
-                f"objective.terms.{name}: no such term is registered; {_near(name, LOSS_TERMS)}"
+                f"objective.terms.{name} is registered by no module imported so far{near(name, LOSS_TERMS)}"
             )
         if not coefficient:
             continue
@@ -91,10 +93,3 @@ def make_loss_terms(agent: Agent, coefficients: Mapping[str, float]) -> list[Los
         except ValueError as error:
             raise ConfigError(f"objective.terms.{name} is {coefficient}: {error}; or give 0") from error
     return terms
-
-
-def _near(name: str, names: Iterable[str]) -> str:
-    found = difflib.get_close_matches(name, list(names), n=1)
-    if found:
-        return f"did you mean {found[0]!r}?"
-    return f"there are {', '.join(names)}; import the module that registers it first"

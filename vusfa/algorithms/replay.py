@@ -227,10 +227,9 @@ class HindsightReplay:
                 f" fit {capacity} of {self.num_envs}; leave hindsight.capacity and collector.num_envs as they"
                 " were"
             )
-        scene_of, num_states = state["sampler"]["scene_of"], len(self.sampler.scene_of)
-        if scene_of.shape != (num_states,) or not bool(
-            (scene_of >= -1).logical_and(scene_of < num_states).all()
-        ):
+        num_states = len(self.sampler.scene_of)
+        scene_of = state["sampler"]["scene_of"]
+        if scene_of.shape != (num_states,) or bool(((scene_of < -1) | (scene_of >= num_states)).any()):
             raise ValueError(f"seen states {tuple(scene_of.shape)} where there are {num_states}")
         if length:
             rows = state["rows"]
