@@ -167,6 +167,9 @@ def test_coefficients(case: Case) -> None:
         loss = make(case, **dict.fromkeys(case.coefficients, 1.0))
         setattr(loss, name, 3)
         torch.testing.assert_close(loss(transitions(7))[term], 3 * ones[term])
+        whole = make(case, **{name: 2})
+        setattr(whole, name, 0.5)
+        assert getattr(whole, name).item() == 0.5
         with pytest.raises(ValueError, match=f"{name} must be a float"):
             make(case, **{name: "high"})
         if len(case.terms) > 1:

@@ -115,6 +115,12 @@ class NetworkLoss(LossModule):
                 stack.enter_context(use_params(getattr(self, name), getattr(self, f"{name}_params")))
             yield
 
+    def _register_coefficients(self, **values: Any) -> None:
+        """Buffers of floating point, even for whole numbers: they are set by assignment later on."""
+        device, dtype = self._default_device, torch.get_default_dtype()
+        for name, value in values.items():
+            self.register_coeff_buffer(name, value, device=device, dtype=dtype)
+
     def _set_action_keys(self) -> None:
         """Take the actor's own names of its action and of the action's log-probability."""
         actor, accepted = self.actor_network, self._AcceptedKeys.__dataclass_fields__

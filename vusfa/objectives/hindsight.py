@@ -185,8 +185,7 @@ class HindsightLoss(NetworkLoss):
             reduction=reduction,
             functional=functional,
         )
-        self.register_coeff_buffer("critic_coeff", critic_coeff, device=self._default_device)
-        self.register_coeff_buffer("objective_coeff", objective_coeff, device=self._default_device)
+        self._register_coefficients(critic_coeff=critic_coeff, objective_coeff=objective_coeff)
         self.gamma, self.expectile = gamma, expectile
         self.temperature, self.max_weight = temperature, max_weight
         self.goal_reward, self.step_reward = goal_reward, step_reward

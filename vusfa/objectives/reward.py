@@ -104,7 +104,7 @@ class RewardRegressionLoss(NetworkLoss):
         functional: bool = True,
     ) -> None:
         super().__init__({"critic_network": critic_network}, reduction=reduction, functional=functional)
-        self.register_coeff_buffer("reward_coeff", reward_coeff, device=self._default_device)
+        self._register_coefficients(reward_coeff=reward_coeff)
 
     def check(self) -> None:
         """Raise where the critic lacks an entry; ``forward`` does so, too."""

@@ -140,14 +140,11 @@ class USFLoss(ActorCriticLoss):
             distinct=distinct,
         )
         self.bottleneck_on = bottleneck_on
-        device, dtype = self._default_device, torch.get_default_dtype()
         values = (objective_coeff, critic_coeff, successor_coeff, entropy_coeff, bottleneck_coeff)
         coefficients: dict[str, Any] = dict(zip(COEFFICIENTS, values, strict=True))
         self._optional = {name for name in DEFAULTS if coefficients[name] == "auto"}
         coefficients |= {name: DEFAULTS[name] for name in self._optional}
-        for name, value in coefficients.items():
-            self.register_coeff_buffer(name, value, device=device, dtype=dtype)
-        self.register_coeff_buffer("information_target", information_target, device=device, dtype=dtype)
+        self._register_coefficients(**coefficients, information_target=information_target)
         # the last KL, which DualAscent reads; at first the target itself, so that nothing moves
         self.register_buffer("last_kl", self.information_target.clone())
 
