@@ -252,7 +252,7 @@ def test_an_agent_with_a_past(
     tab.wait_for_selector("html[data-ready=yes]")
     assert len(colours(tab, "#x-map")) == 16
     assert tab.locator("#x-again").is_disabled()
-    assert "at most 4 goals a scene." in tab.inner_text("#about")
+    assert "at most 4 goals per scene." in tab.inner_text("#about")
     way = tab.evaluate("at.way")
     tab.locator("#x-map path.s").first.dispatch_event("click")
     assert tab.evaluate("at.way") == way

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from vusfa.report.geometry import floor_plan, slices
+from vusfa.report.geometry import floor_plan, outline, slices
 from vusfa.report.packing import unpack
 from vusfa.scenes import Scene
 
@@ -40,8 +40,11 @@ def test_the_same_pose_twice_is_laid_out():
 def test_a_plan_is_the_scene(make_scene):
     scene: Scene = make_scene("hall", 3, 2)
     plan = floor_plan(scene)
-    assert (plan["name"], plan["states"], plan["cell"], plan["metric"]) == ("hall", 24, 0.5, True)
-    assert torch.allclose(torch.tensor([plan["x"], plan["z"]]).T, scene.location)
+    assert (plan["name"], plan["states"], plan["metre"]) == ("hall", 24, 2.0)
+    assert (plan["width"], plan["height"]) == (3, 2)
+    corner = scene.location - torch.tensor([0.0, 0.5])  # upper left, +z up
+    corner -= scene.location.amin(0)
+    assert torch.allclose(torch.tensor([plan["x"], plan["y"]]).T - 0.5, corner * torch.tensor([2.0, -2.0]))
     assert plan["heading"] == scene.rotation.tolist()
     leads = torch.from_numpy(unpack(plan["next"]))
     blocked = scene.graph < 0
@@ -51,5 +54,19 @@ def test_a_plan_is_the_scene(make_scene):
 
 def test_a_scene_without_places(make_scene):
     plan = floor_plan(Scene("nowhere", make_scene().graph, make_scene().features))
-    assert not plan["metric"]
-    assert len(set(zip(plan["x"], plan["z"], strict=True))) == 16
+    assert plan["metre"] is None
+    assert len(set(zip(plan["x"], plan["y"], strict=True))) == 16
+
+
+def test_outlines_fill_the_square():
+    """Their areas sum to it, whatever the headings, and the middle of each lies inside."""
+
+    def area(path: str) -> float:
+        points = np.array([point.split() for point in path[1:-1].split("L")], dtype=float)
+        x, y = points.T
+        return 0.5 * abs(float(np.dot(x, np.roll(y, 1)) - np.dot(y, np.roll(x, 1))))
+
+    for headings in ([0, 90, 180, 270], [30, 45, 200], [350, 10], [5]):
+        _, first, last = slices(np.zeros((len(headings), 2)), np.array(headings, dtype=float))
+        parts = [area(outline(1.5, 0.5, a, b)) for a, b in zip(first, last, strict=True)]
+        assert sum(parts) == pytest.approx(0.94**2, abs=0.01)

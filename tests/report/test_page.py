@@ -100,7 +100,7 @@ def test_who_asks_for_too_many_goals_is_told(runs: list[LoggedRun]):
     content, _ = gather(runs[:1], options)
     assert content["goals_limit"] == 43 < content["goals_asked"] == 99
     assert [len(goals) for goals in content["goals"].values()] == [43, 43]
-    assert "the explorer has 43 goals a scene, for the page's weight" in lines
+    assert "the explorer has 43 goals per scene, to limit the size of the page" in lines
 
 
 def test_every_seed_on_demand(runs: list[LoggedRun]):

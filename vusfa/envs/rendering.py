@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -12,7 +11,7 @@ from torch import Tensor
 
 from vusfa.errors import ConfigError
 from vusfa.scenes import Scene, SceneSet
-from vusfa.scenes.poses import places, step_length
+from vusfa.scenes.poses import dart, places, step_length
 
 __all__ = ["draw_map", "draw_panels"]
 
@@ -96,18 +95,9 @@ def draw_map(scene: Scene, trail: Sequence[int], goal: int, size: int = _HEIGHT)
         )
     path = [pixel(scene.location[state]) for state in trail]
     draw.line(path, fill=_TRAIL, width=max(_SMOOTH, int(half / 3)), joint="curve")
-    dart = max(half * 0.9, side * 0.04)  # to be seen in large rooms, too
-    for state, color, length in ((goal, _GOAL, dart), (trail[-1], _AGENT, dart * 0.9)):
-        draw.polygon(_arrow(pixel(scene.location[state]), float(scene.rotation[state]), length), fill=color)
+    longest = max(half * 0.9, side * 0.04)  # to be seen in large rooms, too
+    for state, color, length in ((goal, _GOAL, longest), (trail[-1], _AGENT, longest * 0.9)):
+        x, y = pixel(scene.location[state])
+        corners = dart(float(scene.rotation[state]))
+        draw.polygon([(x + length * right, y + length * down) for right, down in corners], fill=color)
     return np.asarray(image.resize((size, size), Image.Resampling.LANCZOS))
-
-
-def _arrow(center: _Point, heading: float, length: float) -> list[_Point]:
-    """Dart at ``center`` that points to ``heading`` degrees, 0 = up, 90 = right."""
-    corners = []
-    for turn, reach in ((0.0, 1.0), (140.0, 1.0), (180.0, 0.35), (220.0, 1.0)):
-        angle = math.radians(heading + turn)
-        corners.append(
-            (center[0] + math.sin(angle) * reach * length, center[1] - math.cos(angle) * reach * length)
-        )
-    return corners

@@ -19,7 +19,7 @@ from vusfa.evaluation.summary import metric_columns
 from vusfa.report.by_goal import distance_rows, goal_rows
 from vusfa.report.curves import learning_curves
 from vusfa.report.explorer import choose_goals, choose_starts, sampled_walks, state_maps
-from vusfa.report.geometry import floor_plan
+from vusfa.report.geometry import dart_path, floor_plan
 from vusfa.report.grouping import separate_runs
 from vusfa.report.packing import pack
 from vusfa.report.pictures import thumbnails
@@ -205,7 +205,7 @@ def gather(
     ]
     limit = goal_limit([scene.num_states for scene in scenes.values()], len(shown), options)
     if limit < options.goals_per_scene:
-        options.tell(f"the explorer has {limit} goals a scene, for the page's weight")
+        options.tell(f"the explorer has {limit} goals per scene, to limit the size of the page")
     goals = {name: _explored_goals(scene, rows["goals"], limit) for name, scene in scenes.items()}
     options.tell("floor maps")
     content: dict[str, Any] = {
@@ -222,6 +222,7 @@ def gather(
         "models": [{"label": label, "seeds": sum(run.label == label for run in runs)} for label in labels],
         "tables": {name: rows[name] for name in ("summary", "seeds", "distance", "runs")},
         "curves": learning_curves(runs),
+        "dart": dart_path(),
         "scenes": {name: floor_plan(scene) for name, scene in scenes.items()},
         "maps": _success_maps(rows["goals"], scenes, options.within),
         "goals": goals,
@@ -297,7 +298,8 @@ def _success_maps(rows: Sequence[Row], scenes: Mapping[str, Scene], within: Sequ
         )
     for name in dict.fromkeys(scene for _, scene in found):
         every = torch.arange(scenes[name].num_states)
-        exact = {f"success_{k}": random_walk(scenes[name], every, k) for k in within}
+        limits = {int(key[8:]) for key in rows[0] if key[8:].isdigit() and key.startswith("success_")}
+        exact = {f"success_{k}": random_walk(scenes[name], every, k) for k in sorted(limits.union(within))}
         exact |= {name.replace("success", "exact"): column for name, column in exact.items()}
         maps.append(
             {"model": RANDOM_WALK, "scene": name, "trained": [], "episodes": 0, "seeds": 0}

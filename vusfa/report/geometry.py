@@ -9,9 +9,12 @@ import numpy as np
 
 from vusfa.report.packing import pack_ids
 from vusfa.scenes import Scene
-from vusfa.scenes.poses import step_length
+from vusfa.scenes.poses import dart, step_length
 
-__all__ = ["floor_plan", "slices"]
+__all__ = ["dart_path", "floor_plan", "outline", "slices"]
+
+_HALF = 0.47  # of the square that a place is drawn as; the unit is the distance between neighbouring places
+_WHOLE = 359.9  # a slice of as many degrees is the whole square
 
 
 def slices(location: np.ndarray, rotation: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -57,36 +60,73 @@ def _grid(count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return centre, np.zeros(count), np.full(count, 360.0)
 
 
+def outline(x: float, y: float, first: float, last: float) -> str:
+    """A slice of a square as the path of an SVG, in squares, y downwards.
+
+    Args:
+        x, y: centre of the square.
+        first, last: angles of the slice, degrees, 0 = up, 90 = right.
+
+    >>> outline(0.5, 0.5, -45.0, 45.0)
+    'M0.03 0.03L0.97 0.03L0.5 0.5Z'
+    """
+    whole = last - first > _WHOLE
+    corners = [45.0 + 90.0 * number for number in range(math.floor((first - 45) / 90) + 1, 9)]
+    angles = (
+        [45.0, 135.0, 225.0, 315.0] if whole else [first, *(a for a in corners if first < a < last), last]
+    )
+    points = []
+    for angle in angles:
+        right, up = math.sin(math.radians(angle)), math.cos(math.radians(angle))
+        reach = _HALF / max(abs(right), abs(up))
+        points.append((x + right * reach, y - up * reach))
+    points += [] if whole else [(x, y)]
+    return f"M{'L'.join(f'{round(a, 3):g} {round(b, 3):g}' for a, b in points)}Z"
+
+
+def dart_path() -> str:
+    """The dart of :func:`vusfa.scenes.poses.dart` that points up, as the path of an SVG."""
+    return f"M{'L'.join(f'{x:.3f} {y:.3f}' for x, y in dart())}Z"
+
+
 def floor_plan(scene: Scene) -> dict[str, Any]:
-    """A scene's map as the page draws it.
+    """A scene's map as the page draws it, in squares from the upper left corner.
 
     Args:
         scene: the scene.
 
     Returns:
-        plain data: name, states (N), actions (names), cell (side of a square, metres), metric (False where
-        the places are made up), x, z (N numbers, metres, +z up), first, last (N, degrees), heading (N,
-        degrees), next (packed (N, A): the state each action leads to; a blocked one leads back).
+        plain data: name, states (N), actions (names), width and height of the map, metre (its length; None
+        where the places are made up), x, y (N, centres of the squares), middles (N pairs, a point within each
+        slice), paths (N, :func:`outline` of each slice), heading (N, degrees), next (packed (N, A): the state
+        each action leads to; a blocked one leads back).
 
     >>> plan = floor_plan(Scene.bundled("bathroom"))
-    >>> plan["states"], plan["cell"], len(plan["x"])
-    (176, 0.5, 176)
+    >>> plan["states"], plan["metre"], len(plan["paths"])
+    (176, 2.0, 176)
     """
     location, rotation = scene.location.numpy(), scene.rotation.numpy()
     centre, first, last = slices(location, rotation)
+    metric = bool(np.allclose(centre, location))
+    cell = step_length(scene.location) if metric else 1.0
+    low, high = centre.min(0), centre.max(0)
+    x, y = (centre[:, 0] - low[0]) / cell + 0.5, (high[1] - centre[:, 1]) / cell + 0.5
+    whole, angle = last - first > _WHOLE, np.radians((first + last) / 2)
+    away = np.where(whole, 0.0, 0.3) * np.stack([np.sin(angle), -np.cos(angle)])
     graph = scene.graph.numpy()
     stay = np.arange(len(graph))[:, None]
-    metric = bool(np.allclose(centre, location))
+    width, height = ((high - low) / cell + 1).tolist()
     return {
         "name": scene.name,
         "states": scene.num_states,
         "actions": list(scene.actions),
-        "cell": round(step_length(scene.location), 3) if metric else 1.0,
-        "metric": metric,
-        "x": np.round(centre[:, 0], 3).tolist(),
-        "z": np.round(centre[:, 1], 3).tolist(),
-        "first": np.round(first, 2).tolist(),
-        "last": np.round(last, 2).tolist(),
+        "width": round(width, 3),
+        "height": round(height, 3),
+        "metre": round(1 / cell, 3) if metric else None,
+        "x": np.round(x, 3).tolist(),
+        "y": np.round(y, 3).tolist(),
+        "middles": np.round(np.stack([x, y], 1) + away.T, 3).tolist(),
+        "paths": [outline(*numbers) for numbers in np.stack([x, y, first, last], 1).tolist()],
         "heading": np.round(rotation, 2).tolist(),
         "next": pack_ids(np.where(graph < 0, stay, graph)),
     }

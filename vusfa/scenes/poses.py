@@ -7,12 +7,28 @@ import math
 import torch
 from torch import Tensor
 
-__all__ = ["places", "spread_poses", "step_length"]
+__all__ = ["dart", "places", "spread_poses", "step_length"]
 
 
 def places(location: Tensor) -> Tensor:
     """The distinct places (P, 2) among the locations (N, 2) of poses."""
     return location.unique(dim=0)
+
+
+def dart(heading: float = 0.0) -> list[tuple[float, float]]:
+    """Corners of the dart that stands for a pose on maps, about its middle; y downwards, at most 1 away.
+
+    Args:
+        heading: degrees that it points to, 0 = up, 90 = right.
+
+    >>> dart(90.0)[0]
+    (1.0, -0.0)
+    """
+    corners = []
+    for turn, reach in ((0.0, 1.0), (140.0, 1.0), (180.0, 0.35), (220.0, 1.0)):
+        angle = math.radians(heading + turn)
+        corners.append((math.sin(angle) * reach, round(-math.cos(angle) * reach, 12)))
+    return corners
 
 
 def step_length(location: Tensor) -> float:

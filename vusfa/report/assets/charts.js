@@ -19,7 +19,7 @@ function layout(more) {
   return merged;
 }
 
-// Plotly fills its host, which must be as high as the chart is to be; on a narrow screen the legend stands above it, a line a model.
+// Plotly fills its host, which must be as high as the chart; on a narrow screen the legend is above it, one line per model.
 function plot(id, traces, wanted) {
   const named = traces.filter((trace) => trace.name && trace.showlegend !== false).length;
   const height = wanted.height + (narrow() ? 21 * named : 0);
@@ -99,7 +99,7 @@ function drawSummary() {
     return make("tr", { class: row.kind }, label, make("td", {}, known(row.seeds) ? String(row.seeds) : ""), ...cells);
   });
   const count = rows.find((row) => row.kind === "model");
-  const caption = count ? `${grouped(count.num_goals)} goals, ${known(count.num_episodes) ? grouped(count.num_episodes) : "no"} episodes a seed` : "no evaluation";
+  const caption = count ? `${grouped(count.num_goals)} goals, ${known(count.num_episodes) ? grouped(count.num_episodes) : "no"} episodes per seed` : "no evaluation";
   $("summary").replaceChildren(make("caption", {}, caption), make("thead", {}, head), make("tbody", {}, ...body));
   $("summary").caption.style.cssText = "caption-side:bottom;text-align:left;padding:8px 14px;color:var(--muted);font-size:0.84rem;border-top:1px solid var(--line)";
 }
@@ -125,9 +125,9 @@ function drawDistance() {
 }
 
 const CURVES = {
-  success: "episodes that met their goal (%)", length: "length of the episodes that arrived (actions)", length_ratio: "length over shortest path",
-  collisions: "blocked actions (share of all, %)", explained_variance: "variance of the returns that the critic explains", entropy: "entropy of the policy (nats)",
-  kl: "divergence of the codes from N(0, 1) (nats)", loss_critic: "loss of the critic", loss_successor: "loss of ψ", hindsight_value: "value of hindsight's goals", grad_norm: "norm of the gradient",
+  success: "success (%)", length: "length of successful episodes (actions)", length_ratio: "length over shortest path",
+  collisions: "blocked actions (% of all)", explained_variance: "explained variance of the returns", entropy: "entropy of the policy (nats)",
+  kl: "KL of the latent from N(0, 1) (nats)", loss_critic: "critic loss", loss_successor: "successor feature loss", hindsight_value: "value of hindsight goals", grad_norm: "gradient norm",
 };
 
 function running(values, width) {

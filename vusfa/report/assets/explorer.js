@@ -1,4 +1,4 @@
-// The explorer: one agent, one scene, one goal; what it thinks of every state, and a walk, step by step.
+// The explorer: one agent, one scene, one goal; its value and policy at every state, and an episode, step by step.
 
 const at = { map: null, mapScene: null, way: [], step: 0, timer: null, own: null };
 
@@ -65,15 +65,15 @@ function paintExplorer() {
 function drawArrows() {
   const host = at.map.layer("arrows"), scene = sceneNow(), plan = DATA.scenes[scene], width = plan.actions.length;
   if (!$("x-arrows").checked) return host.replaceChildren();
-  const { centres, next } = drawing(scene), shares = slice(viewNow().probabilities, width);
+  const { middles, next } = drawing(scene), shares = slice(viewNow().probabilities, width);
   const drawn = ["", "", "", ""]; // by how sure the agent is
   for (let state = 0; state < plan.states; state++) {
     if (state === Number($("x-goal").value)) continue;
     const action = likeliest(shares, state, width), to = next[state * width + action];
     const level = Math.min(3, Math.max(0, Math.floor(((shares[state * width + action] - 1 / width) / (1 - 1 / width)) * 4)));
-    const [x, y] = centres[state];
+    const [x, y] = middles[state];
     if (to === state) { drawn[level] += `M${(x - 0.06).toFixed(3)} ${y.toFixed(3)}h0.12`; continue; }
-    let dx = centres[to][0] - x, dy = centres[to][1] - y;
+    let dx = middles[to][0] - x, dy = middles[to][1] - y;
     const long = Math.hypot(dx, dy) || 1;
     dx /= long; dy /= long;
     const point = (along, aside) => `${(x + along * dx - aside * dy).toFixed(3)} ${(y + along * dy + aside * dx).toFixed(3)}`;
@@ -84,9 +84,9 @@ function drawArrows() {
 }
 
 function dart(state, size, fill, edge) {
-  const { centres } = drawing(sceneNow()), [x, y] = centres[state], heading = DATA.scenes[sceneNow()].heading[state];
-  const corners = [[0, 1], [140, 1], [180, 0.35], [220, 1]].map(([turn, reach]) => towards(heading + turn, reach * size)).map(([dx, dy]) => `${(x + dx).toFixed(3)},${(y + dy).toFixed(3)}`);
-  return svg("polygon", { points: corners.join(" "), fill, stroke: edge, "stroke-width": size * 0.2, "stroke-linejoin": "round" });
+  const { middles, heading } = DATA.scenes[sceneNow()], [x, y] = middles[state];
+  const transform = `translate(${x} ${y}) rotate(${heading[state]}) scale(${size})`;
+  return svg("path", { d: DATA.dart, transform, fill, stroke: edge, "stroke-width": 0.2, "stroke-linejoin": "round" });
 }
 
 function drawWalk() {
@@ -123,7 +123,7 @@ function showWalk(way) {
   at.way = way;
   at.step = 0;
   const goal = Number($("x-goal").value), arrived = way.at(-1) === goal, shortest = actionsToGo(sceneNow(), goal)[way[0]], count = way.length - 1;
-  const best = Number.isFinite(shortest) ? `the shortest way takes ${shortest}` : "there is no way";
+  const best = Number.isFinite(shortest) ? `the shortest path has ${shortest}` : "there is no path";
   $("x-status").textContent = arrived ? `Arrives after ${count} action${count === 1 ? "" : "s"}; ${best}.` : `Has not arrived after ${count} actions; ${best}.`;
   drawWalk();
 }
@@ -147,7 +147,7 @@ function play() {
   }, at.way.length > 80 ? 60 : 220);
 }
 
-// A walk drawn in the page: right for agents that see one frame, whose next action depends on nothing else.
+// An episode sampled in the page: correct for agents that see one frame, whose actions depend on nothing else.
 function walkFrom(start) {
   const scene = sceneNow(), goal = Number($("x-goal").value), width = DATA.scenes[scene].actions.length;
   const shares = slice(viewNow().probabilities, width), { next } = drawing(scene), way = [start];
@@ -163,8 +163,8 @@ function walkFrom(start) {
 
 function listWalks(chosen = 0) {
   const ways = viewNow().walks[goalIndex()], goal = Number($("x-goal").value);
-  const name = (way, i) => [i, `${i + 1}: ${way.length - 1} actions${way.at(-1) === goal ? "" : ", lost"}`];
-  fill($("x-walk"), [...ways.map(name), ...(at.own ? [["own", "from the pose you chose"]] : [])], chosen);
+  const name = (way, i) => [i, `${i + 1}: ${way.length - 1} actions${way.at(-1) === goal ? "" : ", failed"}`];
+  fill($("x-walk"), [...ways.map(name), ...(at.own ? [["own", "from the pose that you chose"]] : [])], chosen);
 }
 
 function chooseGoal() {
@@ -211,9 +211,9 @@ function chooseAgent(wanted) {
   const agent = agentNow(), scenes = Object.keys(agent.scenes), before = $("x-layer").value, explained = agent.scenes[scenes[0]].explained;
   fill($("x-scene"), scenes.map((name) => [name, words(name)]), sceneNow());
   const components = explained ? explained.map((_, i) => [`psi${i}`, `ψ, component ${i + 1}`]) : [];
-  fill($("x-layer"), [["value", "value"], ...components, ["sure", "probability of the arrow"], ["togo", "shortest way"]], before || "value");
+  fill($("x-layer"), [["value", "value"], ...components, ["sure", "probability of the most probable action"], ["togo", "shortest path"]], before || "value");
   $("x-note").textContent = [
-    agent.markov ? "Press a pose on the map: the agent starts there. Such walks are drawn in this page, from the policy's probabilities." : `This agent ${agent.history > 1 ? `sees its last ${agent.history} frames` : "has a memory"}; map and bars tell what it does where an episode begins.`,
+    agent.markov ? "Click a pose on the map to start the agent there. Such episodes are sampled in this page from the policy's probabilities." : `This agent ${agent.history > 1 ? `sees its last ${agent.history} frames` : "has a memory"}; map and bars show its policy at the beginning of an episode.`,
     explained ? "" : `${agent.model} has no ψ.`,
   ].join(" ");
   chooseScene(wanted);
@@ -222,14 +222,14 @@ function chooseAgent(wanted) {
 
 function sayShares() {
   const { explained } = viewNow();
-  const shares = explained ? ` Components of ψ here hold ${explained.map((share) => percent(share)).join(", ")} of its variance over these goals.` : "";
-  $("x-caption").textContent = `Orange: the goal. White: the agent. Arrows: the most probable action, fainter where the agent is less sure; sideways ones turn.${shares}`;
+  const shares = explained ? ` The components explain ${explained.map((share) => percent(share)).join(", ")} of the variance of ψ over these goals.` : "";
+  $("x-caption").textContent = `Orange: the goal. White: the agent. Arrows: the most probable action, fainter where its probability is lower; sideways arrows are turns.${shares}`;
 }
 
 function openGoal(label, scene, goal, event) {
   const index = DATA.agents.findIndex((agent) => agent.model === label && agent.scenes[scene]);
   const found = index >= 0 ? index : DATA.agents.findIndex((agent) => agent.scenes[scene]);
-  if (found < 0 || !DATA.goals[scene].includes(goal)) return tell(event, `The explorer holds ${DATA.goals[scene].length} goals of this scene; goal ${goal} is none of them.`);
+  if (found < 0 || !DATA.goals[scene].includes(goal)) return tell(event, `The explorer has ${DATA.goals[scene].length} goals of this scene; goal ${goal} is not among them.`);
   hush();
   $("x-agent").value = found;
   fill($("x-scene"), Object.keys(agentNow().scenes).map((name) => [name, words(name)]));
@@ -242,7 +242,7 @@ function startExplorer() {
   $("explorer").hidden = !DATA.agents.length;
   if (!DATA.agents.length) return;
   const most = Math.max(...Object.values(DATA.goals).map((goals) => goals.length));
-  $("explorer-say").textContent = `Choose a model, a scene and a goal: the map shows what the agent expects of every pose on the way there and what it would do, the pictures what it sees. Up to ${most} goals a scene are here: trained ones, those that are reached least, and some spread over the room.`;
+  $("explorer-say").textContent = `Choose a model, a scene and a goal. The map shows the value of every pose for that goal and the most probable action there, the pictures what the agent sees. Each scene has up to ${most} goals: trained ones, those reached least, and some spread over the room.`;
   fill($("x-agent"), DATA.agents.map((agent, i) => [i, `${agent.name}`]));
   $("x-agent").addEventListener("change", () => chooseAgent());
   $("x-scene").addEventListener("change", () => { chooseScene(); sayShares(); });

@@ -1,54 +1,18 @@
-// Floor maps: every place a square, every heading a slice of it; and the maps of success.
+// Floor maps: every place a square, every heading a slice of it, as geometry.py lays them out; the maps of success.
 
-const HALF = 0.47; // of a square's side; the unit is the distance between neighbouring places
-
-function towards(degrees, reach = 1) {
-  const angle = (degrees * Math.PI) / 180;
-  return [Math.sin(angle) * reach, -Math.cos(angle) * reach];
-}
-
-function outline(x, y, first, last) {
-  const rim = (degrees) => {
-    const [dx, dy] = towards(degrees);
-    const reach = HALF / Math.max(Math.abs(dx), Math.abs(dy));
-    return [x + dx * reach, y + dy * reach];
-  };
-  const whole = last - first > 359.9;
-  const angles = whole ? [45, 135, 225, 315] : [first];
-  if (!whole) {
-    for (let corner = 45 + 90 * Math.ceil((first - 45) / 90); corner < last; corner += 90) if (corner > first) angles.push(corner);
-    angles.push(last);
-  }
-  const points = angles.map(rim);
-  if (!whole) points.push([x, y]);
-  return `M${points.map(([a, b]) => `${a.toFixed(3)} ${b.toFixed(3)}`).join("L")}Z`;
-}
-
-// Where things are drawn, computed once for each scene.
+// Where a scene's states are drawn, see geometry.py; `next` unpacked.
 function drawing(scene) {
   const plan = DATA.scenes[scene];
-  if (plan.drawn) return plan.drawn;
-  const lowX = Math.min(...plan.x), highX = Math.max(...plan.x), lowZ = Math.min(...plan.z), highZ = Math.max(...plan.z);
-  const x = plan.x.map((value) => (value - lowX) / plan.cell + 0.5);
-  const y = plan.z.map((value) => (highZ - value) / plan.cell + 0.5);
-  const paths = x.map((_, i) => outline(x[i], y[i], plan.first[i], plan.last[i]));
-  const centres = x.map((_, i) => {
-    if (plan.last[i] - plan.first[i] > 359.9) return [x[i], y[i]];
-    const [dx, dy] = towards((plan.first[i] + plan.last[i]) / 2, 0.3);
-    return [x[i] + dx, y[i] + dy];
-  });
-  const width = (highX - lowX) / plan.cell + 1, height = (highZ - lowZ) / plan.cell + 1;
-  return (plan.drawn = { x, y, paths, centres, width, height, next: unpack(plan.next) });
+  return { ...plan, next: unpack(plan.next) };
 }
 
 function floorMap(host, scene, label, small = false) {
-  const { paths, width, height } = drawing(scene);
-  const plan = DATA.scenes[scene];
+  const { paths, width, height, metre } = DATA.scenes[scene];
   const letter = small ? width * 0.055 : Math.max(0.35, width * 0.026); // a letter's height
   const slices = paths.map((d, i) => svg("path", { class: "s", "data-i": i, d }));
-  const ruler = !plan.metric ? [] : [
-    svg("path", { class: "ruler", "stroke-width": letter * 0.12, d: `M0.1 ${height + 0.35}v${letter * 0.5}h${(1 / plan.cell).toFixed(3)}v-${letter * 0.5}` }),
-    svg("text", { class: "ruler-text", "font-size": letter, x: 0.1 + 1 / plan.cell + letter * 0.5, y: height + 0.35 + letter * 0.7 }, "1 m"),
+  const ruler = metre === null ? [] : [
+    svg("path", { class: "ruler", "stroke-width": letter * 0.12, d: `M0.1 ${height + 0.35}v${letter * 0.5}h${metre}v-${letter * 0.5}` }),
+    svg("text", { class: "ruler-text", "font-size": letter, x: 0.1 + metre + letter * 0.5, y: height + 0.35 + letter * 0.7 }, "1 m"),
   ];
   const groups = ["arrows", "trail", "marks"].map((name) => svg("g", { class: name }));
   host.replaceChildren(svg(
@@ -103,17 +67,17 @@ function startMaps() {
   for (const label of labels) {
     const rows = DATA.maps.filter((row) => row.model === label);
     const cells = make("div", { class: "map-cells" });
-    const of = rows[0].seeds ? `${rows[0].episodes} episodes a goal, of ${rows[0].seeds} seed${rows[0].seeds > 1 ? "s" : ""} together` : "computed exactly, from every start";
+    const of = rows[0].seeds ? `${rows[0].episodes} episodes per goal, from ${rows[0].seeds} seed${rows[0].seeds > 1 ? "s" : ""}` : "computed exactly, from every start";
     grid.append(make("div", { class: "map-row" }, make("h3", {}, label, make("span", {}, of)), cells));
     for (const row of rows) {
       const caption = make("figcaption");
       const floor = make("div", { class: "floor" });
       cells.append(make("figure", {}, caption, floor));
       const map = floorMap(floor, row.scene, `${label}: success of every goal in ${words(row.scene)}`, true);
-      const { centres, width } = drawing(row.scene);
+      const { middles, width } = DATA.scenes[row.scene];
       const size = Math.max(0.16, width * 0.011);
       map.layer("marks").replaceChildren(...row.trained.map(
-        (goal) => svg("circle", { class: "trained", cx: centres[goal][0], cy: centres[goal][1], r: size, "stroke-width": size * 0.45 }),
+        (goal) => svg("circle", { class: "trained", cx: middles[goal][0], cy: middles[goal][1], r: size, "stroke-width": size * 0.45 }),
       ));
       map.listen(
         (state, event) => {

@@ -12,18 +12,18 @@ function introduce() {
   const scenes = Object.values(DATA.scenes), states = scenes.reduce((sum, scene) => sum + scene.states, 0);
   const runs = DATA.tables.runs.length;
   $("lede").replaceChildren(
-    strong(plural(DATA.models.length, "model")), " in ", strong(plural(runs, "run")), ", walking through ", strong(plural(scenes.length, "scene")), " of ",
-    strong(`${grouped(states)} poses`), ": each agent is shown a picture of the place where it should be, and walks there by what it sees.",
+    strong(plural(DATA.models.length, "model")), " in ", strong(plural(runs, "run")), ", in ", strong(plural(scenes.length, "scene")), " of ",
+    strong(`${grouped(states)} poses`), ": each agent is shown a picture of its goal, and moves towards it by what it sees.",
   );
   const { vusfa, torch, python } = DATA.versions;
   const places = [...new Set(DATA.tables.runs.map((row) => row.scenes))];
-  const said = [places.length === 1 && places[0] ? `Every run in: ${words(places[0])}. ` : "", `Made by vusfa ${vusfa} with PyTorch ${torch} and Python ${python}`, DATA.command ? `, by: ${DATA.command}` : "", "."];
+  const said = [places.length === 1 && places[0] ? `All runs are in: ${words(places[0])}. ` : "", `Made by vusfa ${vusfa} with PyTorch ${torch} and Python ${python}`, DATA.command ? `, with: ${DATA.command}` : "", "."];
   const shown = Math.max(0, ...Object.values(DATA.goals).map((goals) => goals.length));
-  said.push(` To keep the page small, values and components of ψ are rounded to 255 levels between the ends of their scales, pictures are shrunk, and the explorer has at most ${shown} goals a scene`);
-  said.push(DATA.goals_limit < DATA.goals_asked ? ` (${DATA.goals_asked} were asked for).` : ".");
+  said.push(` To keep the page small, values and components of ψ are rounded to 255 levels, pictures are scaled down, and the explorer has at most ${shown} goals per scene`);
+  said.push(DATA.goals_limit < DATA.goals_asked ? ` (${DATA.goals_asked} were requested).` : ".");
   const pictures = scenes.reduce((sum, scene) => sum + scene.pictures.ids.length, 0);
   if (pictures && pictures < states) said.push(` It has pictures of ${grouped(pictures)} of the ${grouped(states)} poses.`);
-  said.push(" The tables lie beside this page as CSV, unrounded.", ...DATA.notes.map((note) => ` ${note}`));
+  said.push(" The tables are beside this page as CSV, unrounded.", ...DATA.notes.map((note) => ` ${note}`));
   $("about").textContent = said.join("");
 }
 
