@@ -1,7 +1,7 @@
 """Reference baselines: random walk and shortest path.
 
-On rooms of a few hundred states a random walk meets many goals within 500 steps. A success rate means nothing
-without that number beside it, so it is computed exactly, not sampled.
+In rooms of a few hundred states a random walk reaches many goals within 500 actions. A success rate means
+little without that number beside it; it is computed exactly, not sampled.
 """
 
 from __future__ import annotations
@@ -22,14 +22,13 @@ RANDOM_WALK, SHORTEST_PATH = "random walk", "shortest path"
 
 
 def random_walk(scene: Scene, goals: Tensor, steps: int, unreachable: Unreachable = "skip") -> Tensor:
-    """Exact success of the uniformly random policy within ``steps`` actions, one number a goal.
+    """Exact success of the uniformly random policy within ``steps`` actions, per goal.
 
     Args:
-        scene: where it walks.
+        scene: the room.
         goals: (G,) state ids within the scene.
-        steps: actions allowed.
-        unreachable: as in :func:`vusfa.evaluation.navigation.episode_starts`; with ``"fail"`` the starts
-            without a path count as failures.
+        steps: limit of actions.
+        unreachable: see :func:`~vusfa.evaluation.episode_starts`.
 
     Returns:
         (G,) float64; NaN for a goal that gets no episode.
@@ -47,7 +46,7 @@ def random_walk(scene: Scene, goals: Tensor, steps: int, unreachable: Unreachabl
 
 
 def shortest_paths(episodes: Episodes) -> Episodes:
-    """The same episodes as someone walks them who knows the map: no policy does better.
+    """The same episodes, each along a shortest path: no policy does better.
 
     >>> one = torch.tensor([1])
     >>> lost = Episodes(one * 0, one, one, one < 0, one * 500, one * 4, one * 9, one > 0, ("hall",), 500)

@@ -1,4 +1,4 @@
-"""An agent beside what it must be compared with: random walk, untrained network, shortest path."""
+"""Policies and the baselines on the same episodes."""
 
 from __future__ import annotations
 
@@ -30,10 +30,10 @@ class Comparison:
     """Results of :func:`compare`.
 
     Attributes:
-        episodes: what the agent walked.
-        rows: the summaries of all policies, see :func:`vusfa.evaluation.summary`.
-        settings: how this was measured; plain data.
-        note: how unreachable pairs are counted, in words.
+        episodes: those of the first policy.
+        rows: summaries of all policies, see :func:`vusfa.evaluation.summary`.
+        settings: of the evaluation; plain data.
+        note: how unreachable pairs of start and goal count.
     """
 
     episodes: Episodes
@@ -68,15 +68,14 @@ def check_comparison(
     unreachable: Unreachable = "skip",
     **settings: Any,
 ) -> None:
-    """Refuse what :func:`compare` would refuse, before the training that comes first.
+    """Raise the errors of :func:`compare` early, before a long training.
 
     Args:
-        scenes, goals: of :func:`compare`.
-        episodes_per_goal, max_steps, unreachable: of :func:`vusfa.evaluation.evaluate`.
-        settings: its others, which are not looked at.
+        scenes, goals, episodes_per_goal, max_steps, unreachable: of :func:`compare`.
+        settings: its other arguments, which cannot be wrong here.
 
     Raises:
-        GoalError: a goal that does not exist, or none that can be reached.
+        GoalError: a goal does not exist, or no goal can be reached.
         ConfigError: a number below 1.
 
     >>> check_comparison(SceneSet.bundled(["bathroom"]), "all", max_steps=0)
@@ -104,19 +103,19 @@ def compare(
     progress: Callable[[str, int, int], None] | None = None,
     **settings: Any,
 ) -> Comparison:
-    """Evaluates policies on the same episodes, and puts the random walk and the shortest path beside them.
+    """Evaluate policies on the same episodes, beside the random walk and the shortest path.
 
     Args:
-        policies: by what to call them; the first one's episodes are kept.
+        policies: by name; the episodes of the first are kept.
         scenes: the world.
         goals: global state ids, or whatever :func:`vusfa.envs.goals.resolve_goals` takes.
         trained: global ids of the goals that the first policy was trained on.
-        within: numbers of actions to give the success for.
-        progress: called with (policy, episodes finished, episodes in all).
+        within: limits of actions to report success for.
+        progress: called with (policy, finished episodes, all episodes).
         settings: of :func:`vusfa.evaluation.evaluate`. With ``episodes``, the goals are theirs.
 
     Raises:
-        GoalError: a goal that does not exist, or none that can be reached.
+        GoalError: a goal does not exist, or no goal can be reached.
     """
     given = settings.get("episodes")
     goal_ids = resolve_goals(scenes, goals) if given is None else given[1].unique()

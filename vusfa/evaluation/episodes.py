@@ -1,4 +1,4 @@
-"""The table an evaluation yields: one row an episode, kept as columns."""
+"""The result of an evaluation: a table with one row per episode, stored as columns."""
 
 from __future__ import annotations
 
@@ -19,21 +19,21 @@ _COLUMNS = ("scene", "goal", "start", "success", "length", "shortest", "collisio
 
 @dataclass(frozen=True, eq=False)
 class Episodes:
-    """Episodes that one policy walked; every column a tensor (n,) on the CPU.
+    """Episodes of one policy; every column is a tensor (n,) on the CPU.
 
     Args:
         scene: int64, index into ``scene_names``.
         goal: int64, state id within its scene.
         start: int64, state id within its scene.
-        success: bool, the goal was met within ``max_steps`` actions.
-        length: int64, actions taken (``max_steps`` when the goal was not met).
-        shortest: int64, fewest actions possible, -1 when the goal cannot be reached.
-        collisions: int64, actions that were blocked.
-        trained: bool, the goal is one of those the agent was trained on.
+        success: bool, the goal was reached within ``max_steps`` actions.
+        length: int64, actions taken; ``max_steps`` for a failure.
+        shortest: int64, length of the shortest path, -1 where there is none.
+        collisions: int64, blocked actions.
+        trained: bool, the goal is a trained goal.
         scene_names: names of the scenes.
-        max_steps: actions allowed in an episode.
-        remaining: int64, fewest actions from where it ended to the goal: 0 at the goal, -1 where no path is
-            left; None for a table from before this was kept.
+        max_steps: limit of actions per episode.
+        remaining: int64, shortest path from the last state to the goal: 0 at the goal, -1 where there is
+            none; None in tables of version 0.1.
 
     >>> one = torch.tensor([1])
     >>> table = Episodes(one * 0, one, one * 2, one > 0, one * 5, one * 4, one * 0, one > 0, ("hall",), 500)
@@ -62,7 +62,7 @@ class Episodes:
 
     @property
     def columns(self) -> tuple[str, ...]:
-        """Names of the columns that it has."""
+        """Names of the columns present."""
         return _COLUMNS if self.remaining is None else (*_COLUMNS, "remaining")
 
     def __len__(self) -> int:
@@ -73,7 +73,7 @@ class Episodes:
         return replace(self, **{name: getattr(self, name)[rows] for name in self.columns})
 
     def rows(self) -> Iterator[dict[str, Any]]:
-        """One dictionary an episode, with the scene's name and plain Python values."""
+        """One dictionary per episode, with the scene's name and plain Python values."""
         columns = [getattr(self, name).tolist() for name in self.columns]
         for values in zip(*columns, strict=True):
             row = dict(zip(self.columns, values, strict=True))
@@ -81,7 +81,7 @@ class Episodes:
             yield row
 
     def write_csv(self, path: str | Path) -> Path:
-        """Write one line an episode, atomically; truth values as 0 and 1."""
+        """Write one line per episode, atomically; booleans as 0 and 1."""
         rows = ({k: int(v) if isinstance(v, bool) else v for k, v in row.items()} for row in self.rows())
         return write_csv(path, rows, self.columns)
 

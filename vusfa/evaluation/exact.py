@@ -1,9 +1,9 @@
-"""What a policy of one frame is worth, computed instead of sampled.
+"""Exact metrics of policies of one frame, computed instead of sampled.
 
-Where an agent sees one frame and no more, its actions depend on the state and the goal alone: to each goal
-its walk is a Markov chain on the scene's graph (:mod:`vusfa.scenes.markov`). With h_k(s) the probability of
-having met the goal within k actions from s, h_k - h_{k-1} is that of an episode of k actions, and the
-expectation of a metric follows from the joint distribution of an episode's length and its shortest path.
+The actions of such a policy depend on the state and the goal alone, so its episodes towards a goal are a
+Markov chain on the scene's graph (:mod:`vusfa.scenes.markov`). With h_k(s) the probability of reaching the
+goal within k actions from s, h_k - h_{k-1} is that of an episode of k actions, and the expectation of a
+metric follows from the joint distribution of an episode's length and its shortest path.
 """
 
 from __future__ import annotations
@@ -57,15 +57,16 @@ def uniform_probabilities(num_actions: int) -> Probabilities:
 
 
 class ExpectedWalks(NamedTuple):
-    """Walks of at most K actions to goals: means over all starts that a goal can be reached from, (G,)
-    float64 each.
+    """Expectations over episodes of at most K actions, per goal, over all starts that can reach it.
+
+    Each is (G,) float64.
 
     Attributes:
-        length: actions; a walk that does not arrive counts with all K.
-        success: probability of arriving.
-        arrived_length: actions of walks that arrive, the others counting 0.
-        arrived_shortest: actions of the shortest path from where walks that arrive began, the others 0.
-        shortest: actions of the shortest path.
+        length: actions; a failure counts as K.
+        success: probability of success.
+        arrived_length: actions of successful episodes, 0 for a failure.
+        arrived_shortest: shortest paths of successful episodes, 0 for a failure.
+        shortest: shortest paths.
     """
 
     length: Tensor
@@ -76,7 +77,7 @@ class ExpectedWalks(NamedTuple):
 
     @property
     def length_ratio(self) -> float:
-        """Actions of arriving walks over those of their shortest paths: a ratio of means over goals."""
+        """Length of successful episodes over their shortest paths: a ratio of means over goals."""
         return (self.arrived_length.sum() / self.arrived_shortest.sum()).item()
 
 
@@ -84,7 +85,7 @@ class ExpectedWalks(NamedTuple):
 def expected_walks(
     probabilities: Probabilities | None, scenes: SceneSet, goals: Tensor, max_steps: int = MAX_STEPS
 ) -> ExpectedWalks:
-    r"""What walks to some goals come to in expectation, with T the actions until arrival and K ``max_steps``:
+    r"""Expected length and success of episodes, with T the actions until the goal and K ``max_steps``:
     E[min(T, K)], P(T <= K), E[T; T <= K].
 
     Args:

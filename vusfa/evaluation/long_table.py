@@ -1,9 +1,9 @@
-"""The one long table of results, a pandas frame: one row per run, mode, goal and metric.
+"""The long table of results, a pandas frame: one row per run, mode, goal and metric.
 
-Its columns are run, model, seed, scene, goal (state id within its scene), trained (trained on), mode
+Its columns are run, model, seed, scene, goal (state id within its scene), trained (whether the goal is), mode
 (``sampled``, ``greedy`` or ``exact``), metric, numerator, denominator and value. Numerators and denominators
-are sums over the episodes to the goal, so that :func:`pool` is exact for any set of rows. The baselines are
-runs like any other, without a seed (-1).
+are sums over the episodes to the goal, so :func:`pool` is exact for any set of rows. The baselines are runs
+without a seed (-1).
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ __all__ = [
     "select_goals",
 ]
 
-#: Goals that were trained on, the others, and both.
+#: Trained goals, unseen goals, and both.
 SUBSETS = ("trained", "unseen", "all")
 MEAN_OF_SCENES = "mean of scenes"
 MEAN_OF_STATES = "mean of states"
@@ -66,9 +66,9 @@ def episode_rows(
 
     Args:
         episodes: of one run in one mode.
-        model, run, seed, mode: columns; the run is called like its model where it has no name.
-        within: numbers of actions to give the success within; those above the episodes' limit are left out,
-            and the limit itself is always there.
+        model, run, seed, mode: columns; ``run`` is the model's name by default.
+        within: limits of actions to report success for, see
+            :func:`~vusfa.evaluation.metrics.metrics_within`.
 
     >>> one = torch.tensor([1, 1])
     >>> walks = Episodes(one, one, one, one > 0, one * 150, one * 100, one, one > 0, ("hall", "attic"), 500)
@@ -103,8 +103,8 @@ def exact_rows(
 
     Args:
         exact: of all goals.
-        goals: rows with scene, goal and trained; the goals to take.
-        scenes: names, by the index in ``exact``.
+        goals: rows with scene, goal and trained: the goals to keep.
+        scenes: names, by their index in ``exact``.
         model, run, seed: columns.
     """
     size = 1 + int(max(exact.goal.max(), goals.goal.max()))
@@ -127,13 +127,13 @@ def random_walk_rows(
     within: Sequence[int] = WITHIN,
     unreachable: Unreachable = "skip",
 ) -> pd.DataFrame:
-    """The long table of the random walk: success alone, computed; goals that no start reaches are left out.
+    """The long table of the random walk: exact success; goals that no start can reach are left out.
 
     Args:
         scenes: the world.
         goals: (G,) global state ids.
         trained: global ids of the trained goals.
-        max_steps, within, unreachable: as for the policies that it stands beside.
+        max_steps, within, unreachable: as for the policies beside it.
     """
     goals = goals.cpu()
     scene, local = scenes.scene_id.cpu()[goals], scenes.local_id(goals.to(scenes.scene_id.device)).cpu()
@@ -199,8 +199,7 @@ def pool(table: pd.DataFrame, by: Sequence[str]) -> pd.DataFrame:
     """Sums of numerators and denominators over all rows that agree in ``by``, and their ratio.
 
     Returns:
-        one row per group, with the columns ``by``, numerator, denominator
-        and value (NaN where the denominator is 0).
+        one row per group: the columns ``by``, numerator, denominator and value (NaN for a denominator of 0).
     """
     groups = table.groupby(list(by), observed=True, sort=True)[_SUMMED]
     pooled = groups.sum().reset_index()
@@ -216,8 +215,8 @@ def select_goals(table: pd.DataFrame, subset: str) -> pd.DataFrame:
 def average_over_scenes(table: pd.DataFrame, by: Sequence[str]) -> pd.DataFrame:
     """:func:`pool` per scene and, where there are several scenes, both averages over them.
 
-    The mean of scenes is that of the scenes' values, a scene without a value left out. The mean of states
-    pools all goals. The paper's own table mixes the two.
+    The mean of scenes averages the values of the scenes that have one; the mean of states pools all goals.
+    The paper's own table mixes the two.
 
     Args:
         table: long.
@@ -233,15 +232,15 @@ def average_over_scenes(table: pd.DataFrame, by: Sequence[str]) -> pd.DataFrame:
 
 
 def goal_sums(tables: Sequence[pd.DataFrame], metric: str) -> tuple[Sums, Tensor] | None:
-    """What a metric's mean is made of, per seed and goal.
+    """Numerators and denominators of a metric, per seed and goal.
 
     Args:
         tables: K long tables, one per seed, each of one mode.
         metric: its name.
 
     Returns:
-        sums (K, G) and a number (G,) for the scene of each goal; None where the seeds have different goals,
-        or none.
+        sums (K, G) and the number (G,) of each goal's scene; None where there are no goals, or the seeds have
+        different ones.
     """
     parts = [table[table.metric == metric].sort_values(["scene", "goal"]) for table in tables]
     goals = [list(zip(part.scene, part.goal, strict=True)) for part in parts]
@@ -252,7 +251,7 @@ def goal_sums(tables: Sequence[pd.DataFrame], metric: str) -> tuple[Sums, Tensor
 
 
 def distance_to_trained(scenes: SceneSet, scene: Tensor, goal: Tensor, trained: Tensor) -> Tensor:
-    """Fewest actions to each goal from a trained one of its scene, -1 where there is none.
+    """Fewest actions from a trained goal of the same scene to each goal, -1 where there is none.
 
     Args:
         scenes: the world.
@@ -288,7 +287,7 @@ def distance_bin(index: int) -> str:
 
 
 def row_label(name: str, architecture: str | None = None) -> str:
-    """What a model is called in tables: its row's name, with its architecture unless that is the usual one.
+    """Label of a model in tables: its row's name, and its architecture unless that is ``controlled``.
 
     >>> row_label("vusfa", "paper"), row_label("vusfa", "controlled")
     ('vusfa (paper)', 'vusfa')

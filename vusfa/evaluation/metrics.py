@@ -1,9 +1,9 @@
-"""The registry of metrics: what a set of episodes amounts to.
+"""The registry of metrics.
 
 A metric is one registered function from :class:`~vusfa.evaluation.episodes.Episodes` to a numerator and a
 denominator per episode; over any set of episodes its value is the sum of the numerators over the sum of the
-denominators. A mean has ones for denominators. Every table, interval, CSV file and the report's page read the
-registry, so a new metric is one function:
+denominators (ones for a mean). Every table, interval, CSV file and the report's page read the registry, so a
+new metric is one function:
 
 >>> @register_metric("collision_rate", label="collisions per action", digits=2, higher_is_better=False)
 ... def collision_rate(episodes):
@@ -31,7 +31,7 @@ Parts = Callable[[Episodes], tuple[Tensor, Tensor] | None]
 
 @dataclass(frozen=True)
 class Metric:
-    """One metric and how it is shown.
+    """A metric and how it is shown.
 
     Attributes:
         name: the column's name.
@@ -42,7 +42,7 @@ class Metric:
         unit: ``%`` for shares, which are kept as fractions and printed times 100; or empty.
         digits: decimals to print.
         higher_is_better: the direction of improvement.
-        exact: it reads success, length and shortest alone and its denominators are ones, so that
+        exact: whether it reads success, length and shortest only and its denominators are ones, so that
             :func:`~vusfa.evaluation.exact.exact_goals` can compute its expectation.
     """
 
@@ -58,7 +58,7 @@ class Metric:
 
     @property
     def scale(self) -> float:
-        """What a value is multiplied by to be printed."""
+        """Factor of printed values."""
         return 100.0 if self.unit == "%" else 1.0
 
     @property
@@ -67,7 +67,7 @@ class Metric:
         return f"{self.label}, {self.unit}" if self.unit else self.label
 
     def text(self, value: float) -> str:
-        """A value as tables print it, without its unit.
+        """A value as in tables, without its unit.
 
         >>> METRICS["spl"].text(0.4567), METRICS["spl"].text(math.nan)
         ('45.7', '–')
@@ -98,11 +98,11 @@ def register_metric(
     higher_is_better: bool = True,
     exact: bool = False,
 ) -> Callable[[Parts], Parts]:
-    """Register a function as a metric; see :class:`Metric` for the arguments; ``short`` and
-    ``title`` are the label where they are not given.
+    """Register a function as a metric; arguments as in :class:`Metric`, ``short`` and ``title`` are the label by
+    default.
 
     Raises:
-        ConfigError: a name that is taken.
+        ConfigError: the name is taken.
     """
     if name in METRICS or name.startswith("success_"):
         raise ConfigError(f"a metric called {name!r} is registered already; give another name")
@@ -116,7 +116,7 @@ def register_metric(
 
 
 def success_within(limit: int) -> Metric:
-    """``success_LIMIT``: the share of episodes that met their goal after at most ``limit`` actions.
+    """``success_LIMIT``: the share of episodes that reached their goal within ``limit`` actions.
 
     >>> success_within(100).heading
     'success in 100, %'
@@ -133,7 +133,7 @@ def success_within(limit: int) -> Metric:
 
 
 def get_metric(name: str) -> Metric:
-    """The metric of a column's name.
+    """The metric of this name.
 
     Raises:
         ConfigError: there is none.
@@ -150,11 +150,11 @@ def get_metric(name: str) -> Metric:
 
 
 def metrics_within(within: Sequence[int], max_steps: int) -> list[Metric]:
-    """Success within each number of actions, the largest first, then all registered metrics.
+    """Success within each limit, the largest first, then all registered metrics.
 
     Args:
-        within: numbers of actions; those above ``max_steps`` are left out.
-        max_steps: of the episodes; always among the numbers.
+        within: limits of actions; those above ``max_steps`` are left out.
+        max_steps: of the episodes; always among the limits.
 
     >>> [metric.name for metric in metrics_within([1000, 20], 500)][:3]
     ['success_500', 'success_20', 'spl']
@@ -175,8 +175,8 @@ def spl(episodes: Episodes) -> tuple[Tensor, Tensor]:
 
 @register_metric("soft_spl", label="soft-SPL", short="soft", title="soft-SPL: SPL of the progress", unit="%")
 def soft_spl(episodes: Episodes) -> tuple[Tensor, Tensor] | None:
-    """SPL with progress instead of success: the share of the way to the goal that is behind the agent when
-    the episode ends, ``max(0, 1 - remaining / shortest)`` (Datta et al. 2020, arXiv 2009.03231, sec. 4).
+    """SPL with progress in place of success: the share of the shortest path covered when the episode ends,
+    ``max(0, 1 - remaining / shortest)`` (Datta et al. 2020, arXiv 2009.03231, sec. 4).
     """
     if episodes.remaining is None:
         return None
@@ -202,9 +202,8 @@ def length(episodes: Episodes) -> tuple[Tensor, Tensor]:
 
 @register_metric("length_ratio", label="length / shortest", short="ratio", digits=2, higher_is_better=False)
 def length_ratio(episodes: Episodes) -> tuple[Tensor, Tensor]:
-    """Length of the successful episodes over that of their shortest paths: a ratio of means, not a mean of
-    ratios, in which an episode that starts beside its goal would weigh as much as a long one.
-    """
+    """Length of the successful episodes over their shortest paths: a ratio of means, so that an episode that
+    starts beside its goal does not weigh as much as a long one."""
     return episodes.success * episodes.length, episodes.success * episodes.shortest
 
 

@@ -1,8 +1,8 @@
-"""Batched rollouts of episodes, and the table of how each of them ended.
+"""Batched rollouts of evaluation episodes.
 
 The rules are the environment's own (:mod:`vusfa.envs.dynamics`), on a batch that shrinks: an episode that
-ends leaves it at once and one that waits takes the row, so that the few long episodes at the end cost what
-they weigh, not a full batch a step.
+ends leaves it at once and a waiting one takes its row, so the few long episodes at the end do not cost a full
+batch per step.
 """
 
 from __future__ import annotations
@@ -50,29 +50,28 @@ def evaluate(
 ) -> Episodes:
     """Roll out ``episodes_per_goal`` episodes to every goal.
 
-    The draws come from ``seed`` alone and the caller's random state is left as it was, so an evaluation in
-    the middle of a training does not change the training. The policy is put in evaluation mode meanwhile
-    (means, not samples, of a variational agent's embeddings unless it asks for samples).
+    All draws come from ``seed``; the caller's random state stays, so an evaluation during a training does not
+    change the training. The policy is in evaluation mode meanwhile.
 
     Args:
         policy: reads ``state_id`` (n, H), ``goal_id`` (n,), ``scene_id`` (n,) and writes ``action`` (n,).
         scenes: the world; on the policy's device.
         goals: global state ids, or whatever :func:`vusfa.envs.goals.resolve_goals` takes.
-        trained: global ids of the goals that the policy was trained on; they are marked in the table.
-        episodes: starts and goals (n,), global ids, of a manifest
-            (:mod:`vusfa.experiments.manifest`); then ``goals`` and what follows of draws are not looked at.
-        episodes_per_goal: episodes for each goal, from starts drawn uniformly.
-        max_steps: actions allowed in an episode.
+        trained: global ids of the trained goals, which the table marks.
+        episodes: starts and goals (n,), global ids, of a manifest (:mod:`vusfa.experiments.manifest`); they
+            replace ``goals``, ``episodes_per_goal`` and ``unreachable``.
+        episodes_per_goal: episodes per goal, from starts drawn uniformly.
+        max_steps: limit of actions per episode.
         history: frames H in ``state_id``.
-        sample: draw actions from the policy; False takes the most probable one.
-        unreachable: ``"skip"`` or ``"fail"``, see :func:`episode_starts`.
+        sample: sample actions from the policy, or take the most probable one.
+        unreachable: see :func:`episode_starts`.
         seed: of starts and actions.
-        batch_size: episodes that walk at the same time.
+        batch_size: episodes in parallel.
         observe: adds ``observation`` and ``goal_observation`` for a policy that reads these.
-        progress: called with (episodes finished, episodes in all) after every step.
+        progress: called with (finished episodes, all episodes) after every step.
 
     Raises:
-        GoalError: a goal that does not exist, or none that can be reached.
+        GoalError: a goal does not exist, or no goal can be reached.
     """
     if episodes is not None:
         start, goal = (ids.cpu() for ids in episodes)
@@ -129,21 +128,19 @@ def walk(
     progress: Progress | None = None,
     visited: list[tuple[Tensor, Tensor]] | None = None,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Walk one episode from every start to its goal, in the exploration mode and from the random state in
-    force.
+    """Roll out one episode per pair of start and goal, with the present exploration type and random state.
 
-    A policy with memory writes its next state under ``("next", key)``; it finds it again under ``key``, and
-    ``is_init`` (n, 1) tells it which rows begin.
+    A policy with memory writes its next state under ``("next", key)`` and finds it again under ``key``;
+    ``is_init`` (n, 1) marks the rows that begin.
 
     Args:
         policy, scenes, max_steps, history, batch_size, observe, progress: see :func:`evaluate`.
-        start: (n,) global state ids.
-        goal: (n,) global state ids.
-        visited: gets, per step of the batch, the episodes that moved and the states that they came to.
+        start, goal: (n,) global state ids.
+        visited: gets, per step, the episodes that moved and their new states.
 
     Returns:
-        success (n,) bool, length (n,) int64, collisions (n,) int64 and the state (n,) int64 where each ended,
-        a global id; all on the CPU.
+        success (n,) bool, length (n,) int64, collisions (n,) int64 and last state (n,) int64, a global id; on
+        the CPU.
     """
     if max_steps < 1 or batch_size < 1:
         raise ConfigError(f"max_steps is {max_steps} and batch_size {batch_size}; both must be 1 or more")
@@ -158,7 +155,7 @@ def walk(
 
     rewards = Rewards.of()
     begun = min(total, batch_size)
-    row = torch.arange(begun, device=device)  # which episode each row of the batch walks
+    row = torch.arange(begun, device=device)  # the episode of each row of the batch
     steps = torch.zeros(begun, 1, dtype=torch.int64, device=device)
     frames = start_history(start[row], history)
     memory: dict[tuple[str, ...], Tensor] = {}
@@ -174,16 +171,8 @@ def walk(
         if observe is not None:
             batch = observe(batch)
         batch = policy(batch)
-        end = step(
-            scenes.successor,
-            scenes.blocked,
-            rewards,
-            max_steps,
-            frames,
-            goal[row],
-            steps,
-            batch.get("action"),
-        )
+        action = batch.get("action")
+        end = step(scenes.successor, scenes.blocked, rewards, max_steps, frames, goal[row], steps, action)
         frames, steps = end.state_id, end.elapsed_steps
         success[row] = end.terminated.squeeze(-1)
         length[row] = steps.squeeze(-1)
@@ -220,14 +209,14 @@ def trails(
     seed: int = 0,
     observe: Observe | None = None,
 ) -> list[list[int]]:
-    """The ways of episodes with sampled actions, one from every start.
+    """Trajectories of episodes with sampled actions, one per start.
 
     Args:
         policy, scenes, max_steps, history, seed, observe: see :func:`evaluate`.
         start, goal: (n,) global state ids.
 
     Returns:
-        n lists of global state ids, the start first; one that arrived ends with its goal.
+        n lists of global state ids, the start first; a successful one ends with its goal.
 
     >>> from vusfa.modules import make_agent
     >>> rooms = SceneSet.bundled(["bathroom"])
@@ -238,16 +227,8 @@ def trails(
     """
     visited: list[tuple[Tensor, Tensor]] = []
     with _acting(policy, scenes, True, seed):
-        walk(
-            policy,
-            scenes,
-            start,
-            goal,
-            max_steps=max_steps,
-            history=history,
-            observe=observe,
-            visited=visited,
-        )
+        limits: dict[str, Any] = {"max_steps": max_steps, "history": history}
+        walk(policy, scenes, start, goal, **limits, observe=observe, visited=visited)
     ways = [[state] for state in start.tolist()]
     for rows, states in visited:
         for row, state in zip(rows.tolist(), states.tolist(), strict=True):
@@ -257,8 +238,7 @@ def trails(
 
 @contextmanager
 def _acting(policy: nn.Module, scenes: SceneSet, sample: bool, seed: int) -> Iterator[None]:
-    """Evaluation mode for every submodule, and afterwards each back in the mode it was in; inference policies
-    cached; a random state of its own."""
+    """Evaluation mode, cached inference policies and an own random state; all restored afterwards."""
     modes = [(module, module.training) for module in policy.modules()]
     policy.eval()
     devices = [scenes.device] if scenes.device.type == "cuda" else []

@@ -23,20 +23,19 @@ def episode_starts(
     unreachable: Unreachable = "skip",
     generator: torch.Generator | None = None,
 ) -> tuple[Tensor, Tensor]:
-    """Draws where each episode starts, uniformly, with replacement.
+    """Draw the start of each episode, uniformly, with replacement.
 
     Args:
         scenes: the world.
         goals: (G,) global state ids.
-        episodes_per_goal: episodes for each of them.
-        unreachable: what to do with pairs of start and goal that no path joins. ``"skip"``: only states that
-            can reach the goal in more than 0 steps are starts, and a goal that none can reach gets no
-            episode. ``"fail"``: all other states of the scene are starts; from those without a path the agent
-            walks and fails.
-        generator: source of the draws, on the CPU.
+        episodes_per_goal: episodes per goal.
+        unreachable: what to do with pairs of start and goal without a path. ``"skip"``: only states that can
+            reach the goal are starts, and a goal without starts gets no episode. ``"fail"``: all other states
+            of the scene are starts, and those without a path end in failures.
+        generator: of the draws, on the CPU.
 
     Returns:
-        start and goal, both (n,) global ids, the episodes of one goal in a row, goals in the order given.
+        start and goal, both (n,) global ids, goals in the given order.
 
     >>> scenes = SceneSet.bundled(["bathroom"])
     >>> start, goal = episode_starts(scenes, torch.tensor([7, 3]), 2)
@@ -49,8 +48,8 @@ def episode_starts(
         raise ConfigError(f"unreachable is {unreachable!r}; it must be 'skip' or 'fail'")
     starts, kept = [], []
     for goal in goals.tolist():
-        first, last = _scene_range(scenes, goal)
-        states = torch.arange(first, last)
+        scene = int(scenes.scene_id[goal])
+        states = torch.arange(int(scenes.offsets[scene]), int(scenes.offsets[scene + 1]))
         if unreachable == "skip":
             allowed = states[scenes.distance(states, torch.full_like(states, goal)).cpu() > 0]
         else:
@@ -67,8 +66,3 @@ def episode_starts(
             f" can reach goal {int(scenes.local_id(first))}); give other goals or scenes"
         )
     return torch.cat(starts), torch.tensor(kept).repeat_interleave(episodes_per_goal)
-
-
-def _scene_range(scenes: SceneSet, state: int) -> tuple[int, int]:
-    scene = int(scenes.scene_id[state])
-    return int(scenes.offsets[scene]), int(scenes.offsets[scene + 1])

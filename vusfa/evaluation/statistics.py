@@ -1,17 +1,16 @@
 """Bootstrap intervals over seeds and goals, interquartile means, probability of improvement.
 
-A result is a table of numbers per seed and goal, (K, G). Both are samples, of trainings and of goals, so both
-are drawn again, each with replacement: the crossed, or pigeonhole, bootstrap (Owen 2007, "The pigeonhole
-bootstrap", Annals of Applied Statistics 1(2), sec. 2). Goals are drawn within their scenes, which are given.
-Intervals are percentiles of the resamples. With the same seed and tables of the same shape all models are
-drawn alike, and a difference is one of pairs.
+A result is a table of numbers per seed and goal, (K, G). Seeds and goals are both samples, so both are
+resampled with replacement: the crossed, or pigeonhole, bootstrap (Owen 2007, "The pigeonhole bootstrap",
+Annals of Applied Statistics 1(2), sec. 2). Goals are resampled within their scenes, which are fixed.
+Intervals are percentiles of the resamples. The same seed and shape give the same draws, so differences are paired.
 
-The interquartile mean and the probability of improvement are those of Agarwal et al. 2021, "Deep
-Reinforcement Learning at the Edge of the Statistical Precipice" (arXiv 2108.13264, sec. 4): over seeds and
-scenes, with the seeds drawn again within each scene.
+The interquartile mean and the probability of improvement follow Agarwal et al. 2021, "Deep Reinforcement
+Learning at the Edge of the Statistical Precipice" (arXiv 2108.13264, sec. 4): over seeds and scenes, with
+seeds resampled within each scene.
 
-A bootstrap over five seeds gives intervals that are somewhat too narrow. The interval of one seed is over the
-goals alone; where seeds alone are drawn again, there is none (NaN).
+A bootstrap over five seeds gives intervals that are somewhat too narrow. The interval of one seed is over
+goals only, and NaN where only seeds are resampled.
 """
 
 from __future__ import annotations
@@ -57,7 +56,7 @@ class Draws(NamedTuple):
 
 
 class Sums(NamedTuple):
-    """What a mean, or a ratio of means, is made of, per seed and goal.
+    """Numerator and denominator of a mean or a ratio of means, per seed and goal.
 
     Attributes:
         numerator: (K, G) float64, sums over the episodes of a seed to a goal: of successes, of lengths, ...
@@ -69,7 +68,7 @@ class Sums(NamedTuple):
 
 
 def interval(value: float, draws: Tensor, level: float = 0.95) -> Estimate:
-    """A value with the percentile interval of its resamples; NaN among them drop out.
+    """A value with the percentile interval of its resamples, NaN left out.
 
     Args:
         value: of the data as they are.
@@ -88,7 +87,7 @@ def interval(value: float, draws: Tensor, level: float = 0.95) -> Estimate:
 
 
 def resample_counts(groups: Tensor, resamples: int, generator: torch.Generator) -> Tensor:
-    """Counts of each item when every group is drawn again from itself, with replacement.
+    """Counts of each item when every group is resampled with replacement.
 
     Args:
         groups: (n,) int64, the group of each item.

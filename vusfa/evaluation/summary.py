@@ -34,13 +34,12 @@ Row = dict[str, Any]
 
 
 def summary(episodes: Episodes, policy: str, within: Sequence[int] = WITHIN) -> list[Row]:
-    """What one policy achieved, per subset of goals and scene and averaged over the scenes.
+    """Metrics of one policy, per subset of goals and scene and averaged over the scenes.
 
     Args:
-        episodes: that it walked.
+        episodes: of the policy.
         policy: its name.
-        within: numbers of actions to give the success within, as ``success_500``, ...; those above the
-            episodes' own limit are left out, and the limit itself is always there.
+        within: see :func:`~vusfa.evaluation.metrics.metrics_within`.
 
     Returns:
         rows, see :func:`summarize`.
@@ -58,9 +57,9 @@ def summarize(table: pd.DataFrame) -> list[Row]:
     """One row per model, subset of goals and scene of a long table that holds one seed and mode per model.
 
     Returns:
-        rows with policy, goals (trained, unseen or all), scene, num_goals, num_episodes (NaN for the random
-        walk, whose success is computed) and the metrics, NaN where there is none; the averages over the
-        scenes are those of :func:`~vusfa.evaluation.long_table.average_over_scenes`.
+        rows with policy, goals (trained, unseen or all), scene, num_goals, num_episodes (NaN for exact
+        values) and the metrics, NaN where there is none; averages over the scenes as in
+        :func:`~vusfa.evaluation.long_table.average_over_scenes`.
     """
     rows: list[Row] = []
     names = [*table.metric.cat.categories]
@@ -104,14 +103,13 @@ def random_walk_summary(
     within: Sequence[int] = WITHIN,
     unreachable: Unreachable = "skip",
 ) -> list[Row]:
-    """The random walk's exact success as :func:`summary`'s rows, the other metrics NaN; see
-    :func:`~vusfa.evaluation.long_table.random_walk_rows` for the arguments.
-    """
+    """Rows of :func:`summary` for the random walk's exact success; arguments as in
+    :func:`~vusfa.evaluation.long_table.random_walk_rows`."""
     return summarize(random_walk_rows(scenes, goals, trained, max_steps, within, unreachable))
 
 
 def count_pairs(scenes: Iterable[Scene], unreachable: Unreachable) -> str:
-    """One sentence on the pairs of start and goal that no path joins, and how the tables count them.
+    """A sentence on the pairs of start and goal without a path, and how tables count them.
 
     >>> count_pairs(SceneSet.bundled(["bathroom"]).scenes, "skip")
     'Every goal can be reached from every start.'
@@ -132,10 +130,9 @@ def print_summary(rows: Sequence[Row], console: Console | None = None, note: str
     """Print summaries, one table per subset of goals, policies side by side scene by scene.
 
     Args:
-        rows: of :func:`summary` and :func:`random_walk_summary`, in the order of the policies. Metrics that
-            have no number at all are left out.
-        console: where to; the terminal by default.
-        note: a line beneath.
+        rows: of :func:`summary` and :func:`random_walk_summary`; metrics without any number are left out.
+        console: the terminal by default.
+        note: a line below.
     """
     from rich import box  # of the extra "recipes"; the rest of this module does without
     from rich.console import Console

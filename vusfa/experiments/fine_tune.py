@@ -19,14 +19,12 @@ __all__ = ["fine_tune", "fine_tuning_settings"]
 
 
 def fine_tuning_settings(config: Mapping[str, Any], goals: Tensor, frames: int, seed: int) -> dict[str, Any]:
-    """A training's settings, with other goals, from their start and for so many frames.
-
-    Schedules that ended with the training end with this one.
+    """Settings of a fine-tuning: other goals, another length; schedules that ended with the training end with it.
 
     Args:
-        config: plain, of a checkpoint.
+        config: settings of a checkpoint.
         goals: (G,) global ids.
-        frames: in all.
+        frames: length of the fine-tuning.
         seed: of everything.
     """
     settings = copy.deepcopy(dict(config))
@@ -50,13 +48,13 @@ def fine_tune(
     """Train and evaluate at intervals.
 
     Args:
-        state: a checkpoint's content, whose weights and multiplier are taken over; None trains from scratch.
+        state: a checkpoint, whose weights and multiplier are loaded; None trains from scratch.
         settings: see :func:`fine_tuning_settings`.
         scenes: the world.
         every: frames between two evaluations.
-        episodes_per_goal: of an evaluation, from the same starts each time, for agents that see more than
-            one frame; what one-frame agents do is computed, not sampled. Actions are drawn. An episode that
-            does not arrive counts with all the actions that it was allowed.
+        episodes_per_goal: per evaluation, from the same starts each time, for agents that see more than one
+            frame; one-frame agents are evaluated exactly. Actions are sampled. A failed episode counts as
+            ``max_steps`` actions.
 
     Returns:
         the curve: ``frames``, and at each ``length`` (actions), ``success`` and ``length_ratio``.
@@ -83,7 +81,7 @@ def fine_tune(
 
 
 def _expected(trainer: Trainer) -> tuple[float, float, float]:
-    """Length, success and length over shortest path of an agent that sees one frame: computed."""
+    """Length, success and length over shortest path of a one-frame agent, exact."""
     steps = trainer.settings["env"]["max_steps"]
     policy = TabularPolicy(trainer.agent, trainer.scenes, trainer.goals)
     walks = expected_walks(policy.probabilities, trainer.scenes, trainer.goals, steps)
@@ -91,7 +89,7 @@ def _expected(trainer: Trainer) -> tuple[float, float, float]:
 
 
 def _walked(trainer: Trainer, episodes_per_goal: int) -> tuple[float, float, float]:
-    """The same of any other: of episodes that are walked."""
+    """The same of any other agent, sampled."""
     table = evaluate(
         InferencePolicy(trainer.agent),
         trainer.scenes,

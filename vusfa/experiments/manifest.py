@@ -1,8 +1,8 @@
-"""Which episodes everybody is evaluated on: scene, goal and start of each, and the seed of the actions.
+"""Manifests: the episodes of an evaluation, with the start and goal of each and the seed of the actions.
 
-``manifests/bundled.npz`` is that of the bundled rooms: every state of every room a goal, ten starts each.
-Five goals of each room, none of them trained on, are set apart to choose checkpoints by (``validation``); no
-table counts them. :func:`make_manifest` makes the like for other rooms, and made this one.
+``manifests/bundled.npz`` belongs to the bundled rooms: every state of every room is a goal, with ten starts.
+Five unseen goals per room are held out to choose checkpoints (``validation``); no table counts them.
+:func:`make_manifest` makes manifests of other rooms, and made this one.
 """
 
 from __future__ import annotations
@@ -40,8 +40,8 @@ class Manifest:
     """Episodes; columns (n,) on the CPU.
 
     Attributes:
-        start, goal: int64, global state ids in the set of scenes that it was made for.
-        validation: bool, an episode to choose checkpoints by.
+        start, goal: int64, global state ids in the manifest's scenes.
+        validation: bool, an episode for the choice of checkpoints.
         seed: of the actions.
         fingerprint: of the scenes.
     """
@@ -53,10 +53,10 @@ class Manifest:
     fingerprint: str
 
     def episodes(self, scenes: SceneSet, validation: bool = False) -> tuple[Tensor, Tensor]:
-        """Starts and goals (m,): those to report, or those to choose checkpoints by.
+        """Starts and goals (m,): those to report, or those for the choice of checkpoints.
 
         Raises:
-            ResultError: the scenes are not those it was made for.
+            ResultError: other scenes than the manifest's.
         """
         if scenes.fingerprint != self.fingerprint:
             raise ResultError(
@@ -79,10 +79,10 @@ def make_manifest(
 
     Args:
         scenes: the world.
-        trained: (G,) global ids of goals that are trained on, which are no validation goals.
-        episodes_per_goal: starts of each goal, drawn uniformly among those it can be reached from.
-        validation_goals: of each scene, drawn from its other states that can be reached.
-        seed: of all these draws, and of the actions.
+        trained: (G,) global ids of the trained goals, which are no validation goals.
+        episodes_per_goal: starts per goal, drawn uniformly among those that can reach it.
+        validation_goals: per scene, drawn from its other reachable states.
+        seed: of these draws, and of the actions.
 
     >>> rooms = SceneSet.bundled(["bathroom"])
     >>> manifest = make_manifest(rooms, torch.tensor([3]))

@@ -1,4 +1,4 @@
-"""From checkpoints to a run's results: which checkpoint counts, and its evaluation."""
+"""From checkpoints to a run's results: the choice of a checkpoint, and its evaluation."""
 
 from __future__ import annotations
 
@@ -35,22 +35,21 @@ MODES = ("sampled", "greedy")
 
 
 def manifest_for(scenes: SceneSet, trained: torch.Tensor, path: Path | None = None) -> Manifest:
-    """The named manifest of episodes; when none is named the bundled rooms' own, or for other rooms one made
-    by :func:`~vusfa.experiments.manifest.make_manifest`."""
+    """The manifest in ``path``; by default that of the bundled rooms, or for other rooms a new one, see
+    :func:`~vusfa.experiments.manifest.make_manifest`."""
     manifest = read_manifest(path or BUNDLED_MANIFEST)
     return manifest if path or manifest.fingerprint == scenes.fingerprint else make_manifest(scenes, trained)
 
 
 def choose_checkpoint(checkpoints: Sequence[Path], manifest: Path | None = None) -> dict[Path, float]:
-    """SPL over the episodes to the validation goals, actions drawn; the rule is to take the best, the earlier
-    one of equals.
+    """SPL of checkpoints over the episodes to the validation goals, actions sampled.
 
     Args:
         checkpoints: of one training.
         manifest: see :func:`manifest_for`.
 
     Returns:
-        each one's, best first.
+        SPL by checkpoint, the best first, the earlier one of equals.
     """
     scores = {}
     for path in checkpoints:
@@ -66,12 +65,11 @@ def choose_checkpoint(checkpoints: Sequence[Path], manifest: Path | None = None)
 
 
 def evaluation_policy(agent: Agent, scenes: SceneSet | None = None) -> TensorDictModuleBase:
-    """What acts for an agent in an evaluation: the same actions as its actor's, for less.
+    """Policy for the evaluation of an agent: the same actions as its actor's, computed faster.
 
     Args:
-        agent: as it now is.
-        scenes: where every state is going to be a goal; an agent of one frame is then written down as a
-            table.
+        agent: with its present weights.
+        scenes: given where every state will be a goal; a one-frame agent then becomes a table.
 
     >>> from vusfa.modules import TabularPolicy, make_agent
     >>> rooms = SceneSet.bundled(["bathroom"])
@@ -85,8 +83,8 @@ def evaluation_policy(agent: Agent, scenes: SceneSet | None = None) -> TensorDic
 
 
 def evaluation_precision(agent: Agent, config: Mapping[str, Any]) -> AbstractContextManager[Any]:
-    """The context to evaluate in: bfloat16 as the agent's training was asked for it, for an agent that sees
-    several frames, whose every step has to be computed; float32 for any other.
+    """Autocast of an evaluation: bfloat16 as in the training for an agent of several frames; float32 for any
+    other, whose table is computed once.
 
     Args:
         agent: of the checkpoint.
@@ -100,13 +98,13 @@ def evaluation_precision(agent: Agent, config: Mapping[str, Any]) -> AbstractCon
 def measure_checkpoint(
     checkpoint: Path, experiment: str, name: str, overrides: Sequence[str] = (), manifest: Path | None = None
 ) -> Run:
-    """A run's results: the manifest's episodes with actions drawn and with the likeliest ones, and the
-    exact table where the agent sees one frame.
+    """A run's results: the manifest's episodes with sampled and with greedy actions, and the exact table of a
+    one-frame agent.
 
     Args:
-        checkpoint: of recipes/train.py.
+        checkpoint: of vusfa train.
         experiment, name: of the run.
-        overrides: what the training was started with.
+        overrides: of the training's command line.
         manifest: see :func:`manifest_for`.
     """
     agent, scenes, state = load_agent(checkpoint)
@@ -134,16 +132,15 @@ def walk_manifest(
     validation: bool = False,
     policy: TensorDictModuleBase | None = None,
 ) -> Episodes:
-    """A manifest's episodes, walked by an agent.
+    """Evaluate an agent on a manifest's episodes.
 
     Args:
-        agent, scenes: who walks where.
-        manifest: of episodes.
-        trained: global ids of the goals trained on.
-        title: for the line of progress.
-        sample: draw actions, or take the likeliest.
-        validation: walk the episodes that checkpoints are chosen by, instead of those to report.
-        policy: what acts for the agent; its actor when not given.
+        agent, scenes, manifest: of the evaluation.
+        trained: global ids of the trained goals.
+        title: of the progress line.
+        sample: sample actions, or take the most probable ones.
+        validation: the episodes for the choice of checkpoints, instead of those to report.
+        policy: :func:`evaluation_policy` by default.
     """
     with EvaluationProgress() as progress:
         return evaluate(

@@ -1,8 +1,8 @@
-"""Raw results on disk: ``results/EXPERIMENT/RUN/``, from which every table can be computed again.
+"""Results on disk, ``results/EXPERIMENT/RUN/``: every table is computed from them.
 
 A run is one trained agent. Its folder holds
 
-``cell.json``    what it is: model, seed, settings, trained goals, frames, seconds, machine, versions
+``cell.json``    facts: model, seed, settings, trained goals, frames, seconds, machine, versions
 ``NAME.npz``     the episodes of one mode of evaluation (``sampled``, ``greedy``), columns of small integers
 ``exact.npz``    where it can be computed, :class:`~vusfa.evaluation.exact.ExactGoals`
 
@@ -58,10 +58,10 @@ class Run:
     """The results of one trained agent.
 
     Attributes:
-        experiment, name: its folder.
-        info: plain data, as in cell.json.
+        experiment, name: of its folder.
+        info: facts of cell.json, plain data.
         episodes: tables by mode of evaluation.
-        exact: goal by goal, or None.
+        exact: exact values per goal, or None.
     """
 
     experiment: str
@@ -77,7 +77,7 @@ class Run:
 
     @property
     def label(self) -> str:
-        """What its model is called in tables."""
+        """Label of its model in tables."""
         name = str(self.info.get("row") or self.info.get("model") or self.name)
         return row_label(name, self.info.get("architecture", self.info.get("agent_preset")))
 
@@ -85,8 +85,7 @@ class Run:
         """Its long table, see :mod:`vusfa.evaluation.long_table`.
 
         Args:
-            goals: rows with scene, goal and trained of the exact values; those of the episodes when not
-                given.
+            goals: rows with scene, goal and trained of the exact values; those of the episodes by default.
         """
         head: Any = {"model": self.label, "run": f"{self.experiment}/{self.name}", "seed": self.seed}
         tables = [episode_rows(table, mode=mode, **head) for mode, table in self.episodes.items()]
@@ -98,10 +97,10 @@ class Run:
 
 
 def write_run(root: str | Path, run: Run) -> Path:
-    """Write a run's folder; one of the same name is replaced.
+    """Write a run's folder, replacing one of the same name.
 
     Raises:
-        ResultError: a mode of evaluation is called ``exact``, or no file's name.
+        ResultError: a mode of evaluation is called ``exact``, or cannot be the name of a file.
 
     >>> import tempfile
     >>> with tempfile.TemporaryDirectory() as root:
@@ -194,7 +193,7 @@ def _write_columns(path: Path, columns: Mapping[str, Tensor]) -> None:
 
 
 def _small(column: np.ndarray) -> np.ndarray:
-    """In the smallest type that holds the numbers; chances to seven digits."""
+    """The smallest type that holds the numbers; float32 for probabilities."""
     if column.dtype.kind == "f":
         return column.astype(np.float32)
     if column.dtype.kind == "b" or not column.size:

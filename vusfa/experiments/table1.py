@@ -20,7 +20,7 @@ __all__ = ["checkpoints", "table1"]
 
 
 def checkpoints(folder: Path, overrides: list[str], stages: list[float]) -> list[Path]:
-    """Train as far as each stage and keep a checkpoint there; those that are there already are kept."""
+    """Train up to each stage and keep a checkpoint there; existing ones are kept."""
     cfg = compose_settings([*overrides, f"folder={folder}", "evaluation=none"])
     # interpolated now: schedules end where the whole training ends, whichever part of it runs
     total, last = cfg.total_frames, folder / "checkpoint.pt"
@@ -52,19 +52,19 @@ def table1(
 ) -> None:
     """The paper's Table 1: train, choose a checkpoint and evaluate, per model and seed.
 
-    Results go to RESULTS/EXPERIMENT/MODEL-SEED; what is there is skipped, what was cut off goes on.
+    Results go to RESULTS/EXPERIMENT/MODEL-SEED; existing ones are skipped, interrupted trainings resumed.
     "untrained" is VUSFA before its first update. ``vusfa tables`` prints the tables.
 
     Args:
         overrides: settings of recipes/train.py, such as preset=paper.
         experiment: name of the table.
         models: of the four, and untrained.
-        seeds: paired: all models get the same ones.
-        stages: parts of the training after which a checkpoint is a candidate.
+        seeds: the same for all models.
+        stages: fractions of the training after which a checkpoint is a candidate.
         results: where results are written.
         runs: where trainings keep their checkpoints.
         manifest: of episodes; that of the bundled rooms when not given.
-        again: measure anew the results that are there, from the checkpoints that were chosen.
+        again: evaluate existing results again, from the chosen checkpoints.
     """
     for seed in seeds:
         for model in models:

@@ -1,4 +1,4 @@
-"""Train an agent and evaluate it: what ``vusfa train`` and the recipes run."""
+"""Training and evaluation of an agent: ``vusfa train`` and the recipes."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ __all__ = ["Trained", "compose_settings", "train"]
 
 
 class Trained(NamedTuple):
-    """What :func:`train` leaves.
+    """Result of :func:`train`.
 
     Attributes:
         trainer: with the trained agent.
@@ -44,7 +44,7 @@ class Trained(NamedTuple):
 
 
 def compose_settings(overrides: Sequence[str]) -> DictConfig:
-    """The settings of a training as ``vusfa train`` would make them of these overrides, interpolated."""
+    """Settings of a training, composed from overrides as by ``vusfa train``, and resolved."""
     register_schema()
     settings = compose(overrides=overrides)
     OmegaConf.resolve(settings)
@@ -57,7 +57,7 @@ def train(settings: Mapping[str, Any], overrides: Sequence[str] = ()) -> Trained
 
     Args:
         settings: as in vusfa/conf/train.yaml, resolved.
-        overrides: the command line that made them, kept in checkpoints.
+        overrides: their command line, recorded in checkpoints.
 
     Raises:
         VusfaError: settings that make no sense, or a checkpoint that does not fit them.

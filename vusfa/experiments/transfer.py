@@ -1,7 +1,5 @@
-"""The paper's Figure 2: new goals near the trained ones, or anywhere, and how fast they are learned.
-
-Pure functions: which goals, and what numbers a curve of episode lengths comes to.
-"""
+"""The paper's Figure 2 as pure functions: new goals near and far from the trained ones, and summaries of a
+curve of episode lengths."""
 
 from __future__ import annotations
 
@@ -28,7 +26,7 @@ __all__ = [
     "walked_lengths",
 ]
 
-#: What results call the curves of the two trainings.
+#: Names of the two trainings' curves in results.
 FINE_TUNED, FROM_SCRATCH = "fine-tuned", "from scratch"
 #: Fewest actions from a new goal to the nearest trained one; None: any state that is not trained.
 KINDS: dict[str, int | None] = {"1-step": 1, "2-steps": 2, "4-steps": 4, "random": None}
@@ -47,21 +45,21 @@ def curves_of(info: Mapping[str, Any]) -> list[dict[str, Any]]:
 def new_goals(
     scenes: SceneSet, trained: Tensor, kind: str, index: int, *, per_scene: int = 5, seed: int = 0
 ) -> Tensor:
-    """Draw a set of new goals; the same for whoever asks for the same.
+    """Draw a set of new goals; equal arguments give equal goals.
 
     Args:
         scenes: the world.
-        trained: (G,) global ids of the goals trained on.
+        trained: (G,) global ids of the trained goals.
         kind: of :data:`KINDS`.
-        index: which set of that kind.
-        per_scene: goals of each scene that has trained ones.
+        index: number of the set.
+        per_scene: goals per scene with trained goals.
         seed: of all draws.
 
     Returns:
         (S * per_scene,) int64 global ids, scene by scene.
 
     Raises:
-        GoalError: an unknown kind, or a scene with fewer states of it.
+        GoalError: an unknown kind, or a scene with too few such states.
 
     >>> rooms = SceneSet.bundled(["bathroom"])
     >>> goals = new_goals(rooms, torch.tensor([0, 73]), "1-step", 0, per_scene=3)
@@ -93,13 +91,13 @@ def new_goals(
 
 
 def walked_lengths(scenes: SceneSet, goals: Tensor, max_steps: int = MAX_STEPS) -> tuple[float, float]:
-    """Actions an episode of a random walk and of the shortest path, means over goals and over all starts
-    that a goal can be reached from, see :func:`~vusfa.evaluation.exact.expected_walks`.
+    """Expected actions per episode of a random walk and of the shortest path, means over goals and starts, see
+    :func:`~vusfa.evaluation.exact.expected_walks`.
 
     Args:
         scenes: the world.
         goals: (G,) global ids, scene by scene.
-        max_steps: that a walk may take; one that does not arrive counts with all of them.
+        max_steps: limit of actions, and the length of a failed episode.
 
     >>> walk, shortest = walked_lengths(SceneSet.bundled(["bathroom"]), torch.tensor([3, 90]))
     >>> 500 > walk > 10 * shortest > 10
@@ -110,7 +108,7 @@ def walked_lengths(scenes: SceneSet, goals: Tensor, max_steps: int = MAX_STEPS) 
 
 
 def area_under(frames: Sequence[float], values: Sequence[float]) -> float:
-    """Mean height of a curve over its frames, by trapezia: of episode lengths, less is faster learning.
+    """Mean of a curve over its frames, by the trapezoidal rule; for episode lengths, less is faster learning.
 
     >>> area_under([0, 10, 30], [4.0, 2.0, 2.0])
     2.3333333333333335
@@ -125,8 +123,7 @@ def area_under(frames: Sequence[float], values: Sequence[float]) -> float:
 
 
 def frames_to(frames: Sequence[float], values: Sequence[float], threshold: float) -> float:
-    """Frames at which a curve first comes down to a threshold, between its points by a straight line; NaN
-    when it does not.
+    """Frames at which a curve first falls to a threshold, linear between its points; NaN if it never does.
 
     >>> frames_to([0, 10, 20], [8.0, 4.0, 1.0], 6.0), frames_to([0, 10], [8.0, 7.0], 6.0)
     (5.0, nan)

@@ -42,24 +42,24 @@ def zero_shot(
 ) -> None:
     """Evaluate a checkpoint towards every state of its scenes.
 
-    Trained and unseen goals apart, beside the random walk, the untrained network and the shortest path. The
-    tables go to the terminal; zero_shot.csv, zero_shot.json and zero_shot_episodes.csv beside the checkpoint.
+    Trained and unseen goals are separate tables, beside the random walk, the untrained network and the
+    shortest path. zero_shot.csv, zero_shot.json and zero_shot_episodes.csv are written beside the checkpoint.
 
     Args:
         checkpoint: the file.
-        scenes: bundled names and files, in order, where they have moved since the training.
-        episodes: for every goal.
-        max_steps: actions allowed in an episode.
+        scenes: bundled names and files, in order, if they have moved since the training.
+        episodes: per goal.
+        max_steps: limit of actions per episode.
         goals: all, paper, random:5 (per scene), or a manifest (.yaml).
-        greedy: take the most probable action instead of drawing one.
-        manifest: walk the episodes of Table 1, instead of drawing some: bundled, or a file (.npz).
-            Then episodes, goals, unreachable and the seed of the actions are not looked at.
+        greedy: take the most probable action instead of sampling.
+        manifest: of the episodes, bundled (Table 1) or a file (.npz); it replaces episodes, goals,
+            unreachable and the seed of the actions.
         unreachable: pairs of start and goal without a path: skip leaves them out, fail counts them as
             failures.
         seed: of starts, actions and the untrained network.
         device: where to compute.
         threads: processor threads; more than 1 pays on an idle machine only.
-        out: where to write, without suffix; zero_shot beside the checkpoint when not given.
+        out: where to write, without suffix; zero_shot beside the checkpoint by default.
     """
     set_threads(threads)
     stem = out or checkpoint.with_name("zero_shot")
