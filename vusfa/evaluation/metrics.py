@@ -98,8 +98,9 @@ def register_metric(
     higher_is_better: bool = True,
     exact: bool = False,
 ) -> Callable[[Parts], Parts]:
-    """Register a function as a metric; arguments as in :class:`Metric`, ``short`` and ``title`` are the label by
-    default.
+    """Register a function as a metric; arguments as in :class:`Metric`.
+
+    ``short`` and ``title`` are the label by default.
 
     Raises:
         ConfigError: the name is taken.

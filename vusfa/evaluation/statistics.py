@@ -3,7 +3,8 @@
 A result is a table of numbers per seed and goal, (K, G). Seeds and goals are both samples, so both are
 resampled with replacement: the crossed, or pigeonhole, bootstrap (Owen 2007, "The pigeonhole bootstrap",
 Annals of Applied Statistics 1(2), sec. 2). Goals are resampled within their scenes, which are fixed.
-Intervals are percentiles of the resamples. The same seed and shape give the same draws, so differences are paired.
+Intervals are percentiles of the resamples. The same seed and shape give the same draws, so differences are
+paired.
 
 The interquartile mean and the probability of improvement follow Agarwal et al. 2021, "Deep Reinforcement
 Learning at the Edge of the Statistical Precipice" (arXiv 2108.13264, sec. 4): over seeds and scenes, with

@@ -19,7 +19,9 @@ __all__ = ["fine_tune", "fine_tuning_settings"]
 
 
 def fine_tuning_settings(config: Mapping[str, Any], goals: Tensor, frames: int, seed: int) -> dict[str, Any]:
-    """Settings of a fine-tuning: other goals, another length; schedules that ended with the training end with it.
+    """Settings of a fine-tuning: other goals and another length.
+
+    Schedules that ended with the training end with the fine-tuning.
 
     Args:
         config: settings of a checkpoint.

@@ -91,8 +91,9 @@ def new_goals(
 
 
 def walked_lengths(scenes: SceneSet, goals: Tensor, max_steps: int = MAX_STEPS) -> tuple[float, float]:
-    """Expected actions per episode of a random walk and of the shortest path, means over goals and starts, see
-    :func:`~vusfa.evaluation.exact.expected_walks`.
+    """Expected actions per episode of a random walk and of the shortest path, means over goals and starts.
+
+    See :func:`~vusfa.evaluation.exact.expected_walks`.
 
     Args:
         scenes: the world.
