@@ -11,11 +11,11 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from vusfa.modules.precision import for_autocast, padded_linear
+from vusfa.modules.precision import for_autocast, full_precision, padded_linear
 from vusfa.modules.rows import RowScenes, SceneBlocks, SortedByScene, count_scenes, unknown_scene
 from vusfa.modules.unique import shapes_may_vary
 
-__all__ = ["HistoryLinear", "SceneLinear"]
+__all__ = ["HistoryLinear", "SceneHead", "SceneLinear"]
 
 #: At most this many outputs per row are computed for nothing before rows are sorted by scene instead.
 _DENSE_OUTPUTS = 64
@@ -123,6 +123,18 @@ class SceneLinear(nn.Module):
     def extra_repr(self) -> str:
         """What ``print`` shows of the layer."""
         return f"scenes={self.num_scenes}, in_features={self.in_features}, out_features={self.out_features}"
+
+
+class SceneHead(nn.Module):
+    """Base of heads: a :class:`SceneLinear` on the hidden state, its outputs in full precision."""
+
+    def __init__(self, num_scenes: int, hidden_size: int, out_features: int) -> None:
+        super().__init__()
+        self.linear = SceneLinear(num_scenes, hidden_size, out_features)
+
+    def forward(self, hidden: Tensor, scene_id: RowScenes) -> Tensor:
+        """(\\*B, hidden_size) with scene indices (\\*B,) to (\\*B, out)."""
+        return full_precision(self.linear(hidden, scene_id), self.linear.weight)
 
 
 class HistoryLinear(nn.Module):

@@ -9,27 +9,19 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from vusfa.errors import ConfigError
-from vusfa.modules.linear import SceneLinear
+from vusfa.modules.linear import SceneHead, SceneLinear
 from vusfa.modules.precision import full_precision
 from vusfa.modules.rows import RowScenes
 
 __all__ = ["PolicyHead", "SuccessorPolicyHead"]
 
 
-class PolicyHead(nn.Module):
-    """One linear layer per scene: hidden state to logits (GVF and USFA).
+class PolicyHead(SceneHead):
+    """Logits (\\*B, A), one linear layer per scene on the hidden state (GVF and USFA).
 
     >>> PolicyHead(2, 32, 4)(torch.randn(5, 32), torch.tensor([0, 1, 1, 0, 1])).shape
     torch.Size([5, 4])
     """
-
-    def __init__(self, num_scenes: int, hidden_size: int, num_actions: int) -> None:
-        super().__init__()
-        self.linear = SceneLinear(num_scenes, hidden_size, num_actions)
-
-    def forward(self, hidden: Tensor, scene_id: RowScenes) -> Tensor:
-        """(\\*B, hidden_size) with scene indices (\\*B,) to logits (\\*B, A) float32."""
-        return full_precision(self.linear(hidden, scene_id), self.linear.weight)
 
 
 class SuccessorPolicyHead(nn.Module):
@@ -73,7 +65,7 @@ class SuccessorPolicyHead(nn.Module):
         self.rectify_logits = rectify_logits
 
     def forward(self, hidden: Tensor, successor: Tensor, scene_id: RowScenes) -> Tensor:
-        """(\\*B, hidden_size), psi (\\*B, E) and scene indices (\\*B,) to logits (\\*B, A) float32."""
+        """(\\*B, hidden_size), psi (\\*B, E) and scene indices (\\*B,) to logits (\\*B, A)."""
         constant = successor.detach()
         if self.successor_norm == "layer":
             constant = functional.layer_norm(constant, constant.shape[-1:], eps=1e-6)

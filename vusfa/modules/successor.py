@@ -8,14 +8,14 @@ from __future__ import annotations
 from torch import Tensor, nn
 from torch.nn import functional
 
-from vusfa.modules.linear import SceneLinear
+from vusfa.modules.linear import SceneHead
 from vusfa.modules.precision import full_precision, padded_linear
 from vusfa.modules.rows import RowScenes
 
 __all__ = ["RewardHead", "SuccessorHead", "SuccessorValue", "ValueHead"]
 
 
-class SuccessorHead(nn.Module):
+class SuccessorHead(SceneHead):
     """psi: one linear layer per scene on the hidden state.
 
     Args:
@@ -31,14 +31,12 @@ class SuccessorHead(nn.Module):
     """
 
     def __init__(self, num_scenes: int, hidden_size: int, embedding_size: int, scale: float = 1.0) -> None:
-        super().__init__()
-        self.linear = SceneLinear(num_scenes, hidden_size, embedding_size)
+        super().__init__(num_scenes, hidden_size, embedding_size)
         self.scale = scale
 
     def forward(self, hidden: Tensor, scene_id: RowScenes) -> Tensor:
-        """(\\*B, hidden_size) with scene indices (\\*B,) to (\\*B, E) float32."""
-        # nobody else's: scaled where it lies
-        successor = full_precision(self.linear(hidden, scene_id), self.linear.weight)
+        """(\\*B, hidden_size) with scene indices (\\*B,) to (\\*B, E)."""
+        successor = super().forward(hidden, scene_id)
         return successor if self.scale == 1.0 else successor.mul_(self.scale)
 
 
@@ -63,7 +61,7 @@ class RewardHead(nn.Module):
         self.last = nn.Linear(hidden_size, embedding_size)
 
     def forward(self, goal: Tensor) -> Tensor:
-        """Goal embedding, or a sample of it, (\\*B, E) to (\\*B, E) float32."""
+        """Goal embedding, or a sample of it, (\\*B, E) to (\\*B, E)."""
         first = functional.relu(padded_linear(goal, self.first.weight, self.first.bias))
         weights = padded_linear(first, self.last.weight, self.last.bias)
         return self.scale * full_precision(weights, self.last.weight)
@@ -82,8 +80,8 @@ class SuccessorValue(nn.Module):
         return (successor_features * reward_weights).sum(-1, keepdim=True)
 
 
-class ValueHead(nn.Module):
-    """V of the GVF baseline: one linear layer per scene on the hidden state.
+class ValueHead(SceneHead):
+    """V (\\*B, 1) of the GVF baseline, one linear layer per scene on the hidden state.
 
     >>> import torch
     >>> ValueHead(2, 32)(torch.randn(5, 32), torch.tensor([0, 1, 1, 0, 1])).shape
@@ -91,9 +89,4 @@ class ValueHead(nn.Module):
     """
 
     def __init__(self, num_scenes: int, hidden_size: int) -> None:
-        super().__init__()
-        self.linear = SceneLinear(num_scenes, hidden_size, 1)
-
-    def forward(self, hidden: Tensor, scene_id: RowScenes) -> Tensor:
-        """(\\*B, hidden_size) with scene indices (\\*B,) to (\\*B, 1) float32."""
-        return full_precision(self.linear(hidden, scene_id), self.linear.weight)
+        super().__init__(num_scenes, hidden_size, 1)
