@@ -46,7 +46,7 @@ def carrier(collector: Collector) -> TensorDict:
 
 
 def put_carrier(collector: Collector, content: dict[str, Any]) -> None:
-    """Has a collector step on from what :func:`carrier` gave, as nested dictionaries of tensors."""
+    """Make a collector step on from what :func:`carrier` gave, as nested dictionaries of tensors."""
     before = collector._carrier
     if "step_count" in content and "elapsed_steps" in before:  # its name in checkpoints of version 0.1
         content = {("elapsed_steps" if key == "step_count" else key): value for key, value in content.items()}
@@ -54,7 +54,7 @@ def put_carrier(collector: Collector, content: dict[str, Any]) -> None:
 
 
 def end_weight_sharing(collector: BaseCollector) -> None:
-    """Ends the threads that share weights with a collector's workers."""
+    """End the threads that share weights with a collector's workers."""
     for scheme in (collector._weight_sync_schemes or {}).values():
         scheme.shutdown()
 

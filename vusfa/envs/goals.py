@@ -102,7 +102,7 @@ def read_manifest(path: str | PathLike[str]) -> dict[str, list[int]]:
 
 
 def spread_goals(scene: Scene, count: int) -> list[int]:
-    """Choose goals spread over a scene: farthest-point selection on shortest paths. Deterministic.
+    """Goals spread over a scene: deterministic farthest-point selection on shortest paths.
 
     The first is the farthest from all others on average; each further one has the farthest nearest chosen
     goal. A distance is the mean of there and back, in actions; ties go to the lowest id. Goals are of the
@@ -204,7 +204,7 @@ def _paper(scenes: SceneSet) -> Tensor:
 
 
 def _reachable(scene: Scene) -> Tensor:
-    """States of a scene that some other state leads to."""
+    """States of a scene that another state leads to."""
     source = torch.arange(scene.num_states).unsqueeze(1).expand_as(scene.graph)
     entered = scene.graph[(scene.graph >= 0) & (scene.graph != source)]
     return entered.unique()

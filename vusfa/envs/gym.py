@@ -1,4 +1,4 @@
-"""The same task for Gymnasium: ``gymnasium.make("vusfa/TargetNav-v0")``, and by ``make_vec`` many at once.
+"""The task in Gymnasium: ``gymnasium.make("vusfa/TargetNav-v0")``, and vectorized by ``make_vec``.
 
 Each row draws its starts and goals from a NumPy generator of its own, so that row i of a vector environment
 reset with seed s walks exactly like a single one reset with seed s + i.
@@ -38,7 +38,7 @@ def register() -> None:
 
 
 class TargetNavVector(TellsLimit, VectorEnv[Observation, np.ndarray, np.ndarray]):
-    """Walk to the place where a picture was taken, many agents in one tensor operation each.
+    """Target-driven visual navigation for many agents, each operation on all of them at once.
 
     Args:
         num_envs: n, rows.
@@ -60,7 +60,7 @@ class TargetNavVector(TellsLimit, VectorEnv[Observation, np.ndarray, np.ndarray]
         ConfigError: an argument out of range.
 
     ``info`` holds ``collided`` and ``shortest_path``. ``reset(options={"state": 3, "goal": 80})`` begins at a
-    state of one's choice (global ids).
+    given state (global ids).
 
     >>> envs = gymnasium.make_vec("vusfa/TargetNav-v0", 8, "vector_entry_point", scenes="bathroom")
     >>> envs.reset(seed=0)[0]["state_id"].shape, envs.metadata["autoreset_mode"]
@@ -194,7 +194,7 @@ class TargetNavVector(TellsLimit, VectorEnv[Observation, np.ndarray, np.ndarray]
 
 
 class TargetNavGym(TellsLimit, gymnasium.Env[Observation, np.int64]):
-    """Walk to the place where a picture was taken, one agent.
+    """Target-driven visual navigation for one agent.
 
     Arguments, observations (without their first dimension) and infos are those of :class:`TargetNavVector`.
 
@@ -231,7 +231,7 @@ class TargetNavGym(TellsLimit, gymnasium.Env[Observation, np.int64]):
 
     def step(self, action: np.int64) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """Move by one action."""
-        self._one.ended[:] = False  # who steps on after the end walks on
+        self._one.ended[:] = False  # stepping on after an episode's end is the caller's affair
         observation, reward, *ends, info = self._one.step(np.array([action]))
         terminated, truncated = (bool(end[0]) for end in ends)
         observation, info = self._first(observation, info)

@@ -1,4 +1,4 @@
-"""What the Gymnasium environments stand on: a batched environment that speaks NumPy, and its spaces."""
+"""Base of the Gymnasium environments: a batched environment with NumPy inputs and outputs, and its spaces."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ class Rows(TargetNavEnv):
 
 
 def observation_space(world: SceneSet, history: int, table: np.ndarray | None) -> spaces.Dict:
-    """Space of one row's observations: of ids, or of what the table has for them."""
+    """Observation space of one row: ids, or the table's entries (features or pixels)."""
     scene = spaces.Discrete(world.num_scenes)
     if table is None:
         state = spaces.MultiDiscrete([world.num_states] * history)
@@ -79,14 +79,14 @@ def observation_space(world: SceneSet, history: int, table: np.ndarray | None) -
 
 
 class TellsLimit:
-    """Base of environments whose Gymnasium ``EnvSpec`` tells the task's ``limit`` of actions."""
+    """Mixin: the environment's ``EnvSpec`` has the task's ``limit`` of actions as ``max_episode_steps``."""
 
     limit: int
     _spec: EnvSpec | None = None
 
     @property
     def spec(self) -> EnvSpec | None:
-        """What Gymnasium made it from; ``max_episode_steps`` is the limit in effect."""
+        """The spec that Gymnasium made it from, with the limit in effect."""
         return self._spec
 
     @spec.setter

@@ -26,7 +26,7 @@ __all__ = ["TargetNavEnv"]
 
 
 class TargetNavEnv(SceneEnv):
-    """Walk to the place where a picture was taken, from pictures alone.
+    """Target-driven visual navigation: walk to the pose from which a picture was taken.
 
     Args:
         scenes: the world.
@@ -41,8 +41,8 @@ class TargetNavEnv(SceneEnv):
         goal_reward, step_reward: reward of reaching the goal, and of any other step.
         collision_reward: reward of a blocked step; None for that of any step. The paper's raw values are
             ``goal_reward=10, step_reward=-0.01, collision_reward=-0.1``.
-        seed: where the environment's own random generator begins. None begins somewhere else each time,
-            whatever ``torch.manual_seed`` says, so that workers never repeat one another.
+        seed: of the environment's own random generator. None takes another one each time, whatever
+            ``torch.manual_seed`` says, so that workers never repeat one another.
         device: where the tables and the data are; the CPU by default.
         shortest_path: also write the key of that name. It is privileged (no agent could know it), so no
             policy is given it by default; the trainer's metrics ask for it.
@@ -176,7 +176,7 @@ class TargetNavEnv(SceneEnv):
         start, goals = self._begin()
         entries = {
             "state_id": dynamics.start_history(start, self.history),
-            # copies: nobody may write to the tables through the data
+            # copies, so that writing to the data leaves the tables alone
             "goal_id": goals.goal.clone(),
             "scene_id": goals.scene.clone(),
             "elapsed_steps": self._zeros(torch.int64),
@@ -223,7 +223,7 @@ class TargetNavEnv(SceneEnv):
         return entries
 
     def set_state(self, state: Tensor | int, goal: Tensor | int) -> TensorDictBase:
-        """Begin an episode in every row at a state of one's choice, towards a goal of one's choice.
+        """Begin an episode in every row at a given state, towards a given goal.
 
         Any goal will do, whether or not it is among :attr:`goals`; rows that are later reset draw theirs as
         always.
@@ -247,7 +247,7 @@ class TargetNavEnv(SceneEnv):
         return self.reset(TensorDict(entries, batch_size=self.batch_size, device=self.device), set_state=True)
 
     def _resume(self, tensordict: TensorDictBase) -> dict[str, Tensor]:
-        """Take up the episodes that a tensordict describes; what it leaves out is that of a new episode, and
+        """Resume the episodes that a tensordict describes. Missing entries are those of a new episode, and
         rows whose episode is over begin one."""
         state_id, goal_id = tensordict.get("state_id"), tensordict.get("goal_id", None)
         if goal_id is None:

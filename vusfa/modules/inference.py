@@ -1,9 +1,9 @@
 """Inference-only policies: the actor's actions, without the tensors that only a loss reads.
 
 With few rows per step, moving what a loss may read about costs as much as the matrix products do.
-:class:`InferencePolicy` runs the actor's own layers on plain tensors. While weights stand still
-(:meth:`InferencePolicy.cached`), whatever depends on single frames is computed once, and an agent that sees
-one frame by its id becomes a table (:class:`TabularPolicy`). Nothing else is kept from call to call.
+:class:`InferencePolicy` runs the actor's own layers on plain tensors. While weights are constant
+(:meth:`InferencePolicy.cached`), what depends on single frames is computed once, and an agent that sees one
+frame by its id becomes a table (:class:`TabularPolicy`). Nothing else is kept from call to call.
 """
 
 from __future__ import annotations
@@ -87,15 +87,13 @@ class InferencePolicy(TensorDictModuleBase):
     def cached(
         self, goals: Tensor | None = None, scenes: SceneSet | None = None, rows: int | None = None
     ) -> Iterator[None]:
-        """Within it, answers are of the weights on entry, and what they share is computed once.
-
-        The weights must not change meanwhile, and calls are without gradients.
+        """Context in which the weights are constant and what calls share is computed once, without gradients.
 
         Args:
-            goals: (G,) ids of the only states that will be goals; None for all of the world.
-            scenes: the agent's world, for an agent that sees one frame: all its answers are then tabulated,
-                where these are at most three times as many as ``rows``.
-            rows: rows that will be asked for; None for many.
+            goals: (G,) ids of the only goals to come; None for all states.
+            scenes: the agent's world. An agent that sees one frame is then tabulated, where the table has at
+                most three times as many entries as ``rows``.
+            rows: expected number of rows; None for many.
         """
         before = self._layers, self._table
         try:
@@ -137,7 +135,7 @@ class InferencePolicy(TensorDictModuleBase):
     def _run(
         self, state: Tensor, goal: Tensor, others: dict[Any, Any], blocks: SceneBlocks | None = None
     ) -> dict[Any, Any]:
-        """All that the layers write, from observations of rows and the ``others`` that they read."""
+        """All that the layers write, of observations of rows and the ``others`` that they read."""
         trunk, heads = self._layers or self._own_layers()
         values: dict[Any, Any] = dict(zip(self._trunk_keys, _tuple(trunk(state, goal)), strict=True))
         if blocks is not None:
@@ -280,7 +278,7 @@ class TabularPolicy(TensorDictModuleBase):
 
 
 def _table_pays(scenes: SceneSet, goals: Tensor | None, rows: int | None) -> bool:
-    """Whether a table costs less than its look-ups save: in large products a pair costs a fraction."""
+    """Whether a table costs less than its look-ups save; a pair costs little in a large product."""
     if rows is None:
         return True
     scene = scenes.scene_id if goals is None else scenes.scene_id[goals.to(scenes.device).unique()]

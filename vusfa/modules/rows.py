@@ -13,7 +13,7 @@ from vusfa.errors import ConfigError
 
 __all__ = ["RowScenes", "SceneBlocks", "SortedByScene", "count_scenes", "unknown_scene"]
 
-#: Rows are laid out in blocks of one size where that makes them at most this many times as many.
+#: Rows are laid out in blocks of one size where padding multiplies their number by at most this.
 _PADDING = 1.5
 
 
@@ -92,7 +92,7 @@ class SceneBlocks(NamedTuple):
         whole = len(rows.counts) * size
         if not size or whole > _PADDING * number:
             return None
-        # each scene's rows stand so much further on than among the sorted ones
+        # offset of each scene's rows from their place among the sorted ones
         before = itertools.accumulate(rows.counts[:-1], initial=0)
         further = torch.tensor([index * size - first for index, first in enumerate(before)])
         places = further[rows.scene] + torch.arange(number)

@@ -1,4 +1,4 @@
-"""Siamese encoder phi: the same weights for the state that the agent is in and the goal that it looks for.
+"""Siamese encoder phi: the same weights for the agent's state and its goal.
 
 Features go through a layer over the history (:class:`~vusfa.modules.HistoryLinear`) and a linear layer. The
 result is phi or, with a bottleneck, mean and scale of a Gaussian whose mean is phi. Ids are encoded once per
@@ -40,7 +40,7 @@ class Encoding(NamedTuple):
     kl: Tensor | None = None
 
     def gather(self, index: Tensor | None, batch: torch.Size) -> Encoding:
-        """The encodings of rows, (\\*batch, ...) each; one look-up per tensor, even if it stands twice."""
+        """Encodings of rows, (\\*batch, ...) each; a tensor that occurs twice is looked up once."""
         parts = {id(part): gather(part, index).view(*batch, -1) for part in self if part is not None}
         return Encoding(parts[id(self.embedding)], *(parts.get(id(part)) for part in self[1:]))
 
@@ -68,7 +68,7 @@ class Branch(nn.Module):
 
 
 class SiameseEncoder(nn.Module):
-    """Embeds the state (its last H frames) and the goal (its one frame, in all H places).
+    """Embedding of the state (its last H frames) and the goal (its one frame, in all H places).
 
     Args:
         frames: where the features of a frame come from.
@@ -147,7 +147,7 @@ class SiameseEncoder(nn.Module):
         return joined(of_state, of_goal)
 
     def check_ids(self, state: Tensor, goal: Tensor) -> None:
-        """Raise a ConfigError where ids are none of the world's; for whoever has failed with them."""
+        """Raise a ConfigError for ids outside the world, where an operation on them has failed."""
         for name, ids in (("state_id", state), ("goal_id", goal)) if self.by_id else ():
             wrong = ids[(ids < 0) | (ids >= self.frames.num_states)]
             if len(wrong):

@@ -100,7 +100,7 @@ class SiameseTrunk(nn.Module):
 
 
 class CachedTrunk:
-    """A trunk's ``fused`` while its weights stand still: what depends on one frame is computed once.
+    """A trunk's ``fused`` for constant weights: what depends on one frame is computed once.
 
     Args:
         trunk: reads ids; its weights are read now.

@@ -72,7 +72,7 @@ class Rows(NamedTuple):
 
 
 def unique_rows(*columns: Tensor) -> Unique:
-    """The distinct rows of one or more columns (\\*B,) of integers that are not negative."""
+    """Distinct rows of one or more columns (\\*B,) of non-negative integers."""
     first, *others = (column.reshape(-1).long() for column in columns)
     if not others:
         distinct, index = torch.unique(first, return_inverse=True)
@@ -87,7 +87,7 @@ def unique_rows(*columns: Tensor) -> Unique:
 
 
 def gather(values: Tensor, index: Tensor | None) -> Tensor:
-    """Values (D, ...) of distinct rows, row by row: (\\*B, ...) for an index (\\*B,); as they are for None.
+    """Values (\\*B, ...) of all rows, from those (D, ...) of distinct rows and an index (\\*B,) or None.
 
     >>> gather(torch.tensor([[1.0], [5.0]]), torch.tensor([1, 1, 0])).flatten().tolist()
     [5.0, 5.0, 1.0]
