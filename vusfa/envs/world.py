@@ -112,29 +112,25 @@ def env_specs(scenes: SceneSet, batch_size: torch.Size, history: int, shortest_p
     """Describe the data of a :class:`TargetNavEnv`; its docstring lists the keys."""
     once = (*batch_size, 1)
 
-    def count() -> Bounded:
-        return Bounded(0, torch.iinfo(torch.int64).max, shape=once, dtype=torch.int64)
-
     def ids(number: int, *more: int) -> Categorical:
         return Categorical(number, shape=(*batch_size, *more), dtype=torch.int64)
 
-    def truth() -> Categorical:
-        return Categorical(2, shape=once, dtype=torch.bool)
+    def flags(*keys: str) -> dict[str, TensorSpec]:
+        return {key: Categorical(2, shape=once, dtype=torch.bool) for key in keys}
 
-    def state() -> dict[str, TensorSpec]:
-        specs = {
-            "state_id": ids(scenes.num_states, history),
-            "goal_id": ids(scenes.num_states),
-            "scene_id": ids(scenes.num_scenes),
-            "elapsed_steps": count(),
-            "shortest_path": count(),
-        }
-        return {key: specs[key] for key in STATE if shortest_path or key != "shortest_path"}
-
+    count = Bounded(0, torch.iinfo(torch.int64).max, shape=once, dtype=torch.int64)
+    state: dict[str, TensorSpec] = {
+        "state_id": ids(scenes.num_states, history),
+        "goal_id": ids(scenes.num_states),
+        "scene_id": ids(scenes.num_scenes),
+        "elapsed_steps": count,
+    }
+    if shortest_path:
+        state["shortest_path"] = count
     return Specs(
-        state=Composite(state(), shape=batch_size),
-        observation=Observed({**state(), "collided": truth()}, shape=batch_size),
+        state=Composite(state, shape=batch_size).clone(),
+        observation=Observed({**state, **flags("collided")}, shape=batch_size).clone(),
         action=ids(scenes.num_actions),
         reward=Unbounded(shape=once, dtype=torch.float32),
-        done=Composite({key: truth() for key in ("done", "terminated", "truncated")}, shape=batch_size),
+        done=Composite(flags("done", "terminated", "truncated"), shape=batch_size),
     )
