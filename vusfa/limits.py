@@ -19,6 +19,12 @@ MAX_STATES = 16_384
 MAX_COMPRESSION = 200
 #: The same for raw pictures, which are read some at a time: what gzip reaches with a single color.
 MAX_PICTURE_COMPRESSION = 1100
+#: Size of features beyond what is stored of them.
+MAX_EXTRA_BYTES = 3 << 28
+#: Size of an attribute, were all of its texts as long as the file's longest.
+MAX_ATTRIBUTE_BYTES = 1 << 28
+#: Characters of a scene's name.
+MAX_NAME = 200
 #: Size of a chunk, which is read as a whole.
 MAX_CHUNK_BYTES = 1 << 28
 #: Texts and JPEG files of a scene.

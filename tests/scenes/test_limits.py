@@ -171,6 +171,34 @@ def test_zeros_in_the_heap_of_texts_and_pictures(make_file: Make, length: int) -
         Scene.load(path)
 
 
+def test_texts_that_are_shared_by_many_entries(make_file: Make, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = make_file(attributes={"credits": ["x" * 1000] * 50, "numbers": np.zeros(100)})
+    assert len(Scene.load(path).attributes["credits"]) == 50
+    monkeypatch.setattr("vusfa.limits.MAX_ATTRIBUTE_BYTES", 40_000)
+    assert "attribute 'credits' declares up to" in fault(path)
+    monkeypatch.setattr("vusfa.limits.MAX_ATTRIBUTE_BYTES", 700)
+    assert "attribute 'numbers' declares up to 800 bytes" in fault(
+        make_file(attributes={"numbers": np.zeros(100)})
+    )
+
+
+@pytest.mark.parametrize("name", ["x" * 201, "a\x1b[31m", "two\nlines"])
+def test_names_that_messages_cannot_show(make_file: Make, name: str) -> None:
+    text = fault(make_file(attributes={"scene": name}))
+    assert "attribute 'scene' is " in text
+    assert text.isprintable()
+    assert len(text) < 500
+
+
+def test_features_that_swell(make_file: Make, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = make_file(resnet_feature=None)
+    with h5py.File(path, "a") as file:
+        file.create_dataset("resnet_feature", data=np.ones((5, 4, 100)), compression=9)
+    assert validate(path) == []
+    monkeypatch.setattr("vusfa.limits.MAX_EXTRA_BYTES", 10_000)
+    assert "are stored; at most 10000 more are read" in fault(path)
+
+
 def test_chunks_are_bounded(make_file: Make, pictures: np.ndarray, monkeypatch: pytest.MonkeyPatch) -> None:
     path = make_file()
     with h5py.File(path, "a") as file:

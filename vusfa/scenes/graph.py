@@ -181,7 +181,7 @@ def _components(table: np.ndarray, connection: str) -> tuple[tuple[int, ...], ..
 
 
 def weak_components(graph: Tensor | np.ndarray) -> tuple[tuple[int, ...], ...]:
-    """States joined by moves in either direction, as sorted tuples, the largest component first.
+    """Weakly connected components as sorted tuples of states, the largest first.
 
     >>> weak_components(torch.tensor([[1], [-1], [3], [2], [2]]))
     ((2, 3, 4), (0, 1))
@@ -190,7 +190,7 @@ def weak_components(graph: Tensor | np.ndarray) -> tuple[tuple[int, ...], ...]:
 
 
 def strong_components(graph: Tensor | np.ndarray) -> tuple[tuple[int, ...], ...]:
-    """States that can all reach one another, as sorted tuples, the largest component first.
+    """Strongly connected components as sorted tuples of states, the largest first.
 
     >>> strong_components(torch.tensor([[1], [-1], [3], [2], [2]]))
     ((2, 3), (0,), (1,), (4,))

@@ -14,9 +14,19 @@ import h5py
 import numpy as np
 
 from vusfa import limits
-from vusfa.errors import SceneError
+from vusfa.errors import SceneError, VusfaError
+from vusfa.limits import brief
 
-__all__ = ["check_heaps", "copy_others", "dataset_in", "opened", "plain", "read_distances", "replaced"]
+__all__ = [
+    "check_heaps",
+    "copy_others",
+    "dataset_in",
+    "opened",
+    "plain",
+    "read_attributes",
+    "read_distances",
+    "replaced",
+]
 
 
 @contextmanager
@@ -37,7 +47,7 @@ def opened(path: Path) -> Iterator[h5py.File]:
         raise SceneError(f"{path}: may not be read ({error.strerror}); change its permissions") from error
     # What HDF5 meets in a damaged file comes as any of these.
     except (OSError, RuntimeError, KeyError, ValueError) as error:
-        if isinstance(error, SceneError):
+        if isinstance(error, VusfaError):
             raise
         if isinstance(error, BlockingIOError) or "unable to lock" in str(error):
             raise SceneError(
@@ -50,15 +60,15 @@ def opened(path: Path) -> Iterator[h5py.File]:
         ) from error
 
 
-def check_heaps(path: Path) -> None:
-    """Check the global heaps of a file, which hold text and JPEG files.
+def check_heaps(path: Path) -> int:
+    """Check the global heaps of a file, which hold text and JPEG files; returns the bytes of the largest.
 
     The HDF5 library, up to version 2.0 at least, never returns from a heap that was overwritten with zeros.
 
     Raises:
         SceneError: a heap is damaged.
     """
-    objects = 0
+    objects = largest = 0
     with open(path, "rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
         heap = data.find(b"GCOL")
         while heap >= 0:
@@ -67,11 +77,31 @@ def check_heaps(path: Path) -> None:
             while place + 16 <= end <= len(data):
                 size = int.from_bytes(data[place + 8 : place + 16], "little")
                 step = 16 + (size + 7) // 8 * 8 if any(data[place : place + 2]) else size
-                objects += 1
+                objects, largest = objects + 1, max(largest, size)
                 if step == 0 or objects > limits.MAX_HEAP_OBJECTS:
                     raise SceneError(f"{path}: is damaged at byte {place}; copy the file or make it again")
                 place += step
             heap = data.find(b"GCOL", heap + 4)
+    return largest
+
+
+def read_attributes(file: h5py.File, largest: int) -> dict[str, Any]:
+    """The attributes of a file as plain values.
+
+    Args:
+        file: an open file.
+        largest: bytes of its largest text, see :func:`check_heaps`; entries can share one.
+
+    Raises:
+        OSError: an attribute declares more than :data:`vusfa.limits.MAX_ATTRIBUTE_BYTES`.
+    """
+    for key in file.attrs:
+        declared = file.attrs.get_id(key)
+        held = largest if declared.dtype.hasobject else declared.dtype.itemsize
+        size, most = math.prod(declared.shape or ()) * held, limits.MAX_ATTRIBUTE_BYTES
+        if size > most:
+            raise OSError(f"attribute {brief(key)} declares up to {size} bytes; at most {most} are read")
+    return {key: plain(value) for key, value in file.attrs.items()}
 
 
 @contextmanager
@@ -172,19 +202,19 @@ def _copy_attributes(source: h5py.Dataset, target: h5py.Dataset) -> None:
 
 
 def size_fault(dataset: h5py.Dataset) -> str | None:
-    """The fault of a dataset that declares more than it can hold; None when it does not."""
+    """The fault of a dataset that declares more than it can hold or more than may be read; None without."""
+    declared, stored = dataset.nbytes, dataset.id.get_storage_size()
     if dataset.shape and dataset.shape[0] > limits.MAX_STATES:
         return f"declares {dataset.shape[0]} states; at most {limits.MAX_STATES} are read"
-    stored = dataset.id.get_storage_size()
     times = limits.MAX_PICTURE_COMPRESSION if dataset.ndim == 4 else limits.MAX_COMPRESSION
-    if dataset.nbytes > max(limits.UNCOMPRESSED_BYTES, times * stored):
-        return (
-            f"declares {dataset.nbytes} bytes, but {stored} are stored; at most {times} times that are read"
-        )
-    if dataset.chunks and math.prod(dataset.chunks) * dataset.dtype.itemsize > limits.MAX_CHUNK_BYTES:
-        return (
-            f"has chunks of shape {dataset.chunks}; at most {limits.MAX_CHUNK_BYTES} bytes a chunk are read"
-        )
+    if declared > max(limits.UNCOMPRESSED_BYTES, times * stored):
+        return f"declares {declared} bytes, but {stored} are stored; at most {times} times that are read"
+    most = limits.MAX_EXTRA_BYTES
+    if dataset.ndim == 3 and declared > stored + most:
+        return f"declares {declared} bytes, but {stored} are stored; at most {most} more are read"
+    most = limits.MAX_CHUNK_BYTES
+    if dataset.chunks and math.prod(dataset.chunks) * dataset.dtype.itemsize > most:
+        return f"has chunks of shape {dataset.chunks}; at most {most} bytes per chunk are read"
     return None
 
 

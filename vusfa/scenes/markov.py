@@ -54,7 +54,7 @@ def _as_probabilities(
 
 
 def arrival_by_step(graph: Tensor | np.ndarray, action_probabilities: Any, goals: Any) -> Iterator[Tensor]:
-    """h_0, h_1, h_2, ...: the probability of having met each goal after at most so many actions, without end.
+    """h_0, h_1, h_2, ... without end: the probability of having met each goal after at most so many actions.
 
     Args:
         graph, action_probabilities, goals: see :func:`arrival_probability`. All goals are propagated
@@ -89,29 +89,28 @@ def _steps(successor: np.ndarray, policy: np.ndarray, goals: np.ndarray) -> Iter
 
 
 def goals_at_once(num_states: int, policy_per_goal: bool = True) -> int:
-    """How many goals to propagate together: as many as stay in the processor's cache, which is 3 to 5 times
-    faster than all goals of a large scene."""
+    """Number of goals to propagate together: as many as fit the processor's cache, 3 to 5 times faster."""
     return max(1, (1 << (15 if policy_per_goal else 17)) // max(num_states, 1))
 
 
 def arrival_probability(
     graph: Tensor | np.ndarray, action_probabilities: Any, goals: Any, steps: int
 ) -> Tensor:
-    """Probability of having met each goal after at most ``steps`` actions, from every state; exact.
+    """Exact probability of having met each goal after at most ``steps`` actions, from every state.
 
     Args:
         graph: (N, A) integers, -1 = blocked (the agent stays, the action counts).
-        action_probabilities: (N, A), one policy for all goals, or (G, N, A), one per goal. It must depend on
-            the present state alone: a policy that sees a history of frames has no exact success.
-        goals: one state id, or (G,) of them.
+        action_probabilities: (N, A), one policy for all goals, or (G, N, A), one per goal; of the present
+            state alone: a policy that sees a history of frames has no exact success.
+        goals: one state id, or (G,).
         steps: actions allowed, 0 or more.
 
     Returns:
         (G, N) float64; 1 at the goal itself.
 
     Raises:
-        GoalError: a goal is not a state.
-        ValueError: the probabilities have another shape or are not distributions.
+        GoalError: a goal that is not a state.
+        ValueError: probabilities of another shape, or that are not distributions.
 
     >>> line = torch.tensor([[1, -1], [2, 0], [-1, 1]])  # right, left
     >>> arrival_probability(line, torch.full((3, 2), 0.5), goals=2, steps=2).tolist()
@@ -133,39 +132,24 @@ def arrival_probability(
 
 
 def success_over_starts(graph: Tensor | np.ndarray, arrived: Tensor, goals: Any) -> Tensor:
-    """Mean of ``arrived`` (G, N) over the starts that count, one number per goal.
+    """Mean of ``arrived`` (G, N) over the starts that count, (G,) float64; NaN for a goal without any.
 
-    A start counts when it is not the goal itself and the goal can be reached from it in the graph; all those
-    that count weigh the same. Pairs that no policy could solve are thereby left out, not counted as failures.
+    A start counts, each with the same weight, when it is not the goal and can reach it in the graph: pairs
+    that no policy could solve are left out, not counted as failures.
 
     Args:
-        graph: (N, A) integers, -1 = blocked.
-        arrived: (G, N), as :func:`arrival_probability` gives it.
-        goals: one state id, or (G,) of them.
-
-    Returns:
-        (G,) float64, NaN for a goal that no start can reach.
+        graph, goals: see :func:`arrival_probability`.
+        arrived: (G, N), as :func:`arrival_probability` returns it.
     """
-    table = as_table(graph)
-    counts = steps_to_goals(table, goals) > 0
+    counts = steps_to_goals(as_table(graph), goals) > 0
     total = torch.where(counts, arrived.to(torch.float64), 0.0).sum(1)
     return total / counts.sum(1)
 
 
 def policy_success(graph: Tensor | np.ndarray, action_probabilities: Any, goals: Any, steps: int) -> Tensor:
-    """Exact success of a policy within ``steps`` actions, one number per goal.
+    """Exact success of a policy within ``steps`` actions, (G,) float64 in [0, 1].
 
-    The start is uniform over the states other than the goal from which the goal can be
-    reached in the graph; unreachable pairs are excluded (see :func:`success_over_starts`).
-
-    Args:
-        graph: (N, A) integers, -1 = blocked.
-        action_probabilities: (N, A) or (G, N, A), see :func:`arrival_probability`.
-        goals: one state id, or (G,) of them.
-        steps: actions allowed.
-
-    Returns:
-        (G,) float64 in [0, 1], NaN for a goal that no start can reach.
+    The mean over :func:`success_over_starts`; arguments as for :func:`arrival_probability`.
 
     >>> line = torch.tensor([[1, -1], [2, 0], [-1, 1]])  # right, left
     >>> always_right = torch.tensor([[1.0, 0.0]] * 3)
@@ -177,17 +161,7 @@ def policy_success(graph: Tensor | np.ndarray, action_probabilities: Any, goals:
 
 
 def random_walk_success(graph: Tensor | np.ndarray, goals: Any, steps: int) -> Tensor:
-    """Exact success of the uniformly random policy within ``steps`` actions, one number per goal.
-
-    The baseline of every result. Starts are counted as in :func:`policy_success`.
-
-    Args:
-        graph: (N, A) integers, -1 = blocked.
-        goals: one state id, or (G,) of them.
-        steps: actions allowed.
-
-    Returns:
-        (G,) float64 in [0, 1], NaN for a goal that no start can reach.
+    """Exact success of the uniformly random policy, the baseline of every result; see :func:`policy_success`.
 
     >>> random_walk_success(torch.tensor([[1, -1], [2, 0], [-1, 1]]), goals=[2], steps=2).tolist()
     [0.375]

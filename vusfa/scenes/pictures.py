@@ -92,7 +92,7 @@ def to_jpeg(picture: np.ndarray) -> bytes:
 
 
 def look(file: h5py.File, num_states: int | None) -> tuple[tuple[int, int, int] | None, list[str]]:
-    """Size of a file's pictures (None without any) and their faults, by the header and the first picture."""
+    """Shape of a file's pictures (None without any) and their faults, by the header and the first picture."""
     try:
         found = _find(file)
     except (OSError, RuntimeError) as error:
@@ -100,39 +100,35 @@ def look(file: h5py.File, num_states: int | None) -> tuple[tuple[int, int, int] 
     if found is None:
         return None, []
     name, dataset = found
-    layout = "uint8 (N, H, W, 3)" if name == _RAW else "(N,) of variable-length uint8"
+    shape: tuple[int, ...] = dataset.shape or ()
     held = f"dataset {name!r} holds {dataset.dtype} of shape {dataset.shape}"
     if name == _RAW:
-        fits = dataset.dtype == np.uint8 and len(dataset.shape or ()) == 4 and dataset.shape[3] == 3
+        layout = "uint8 (N, H, W, 3)"
+        fits = dataset.dtype == np.uint8 and len(shape) == 4 and shape[3] == 3
     else:
-        fits = h5py.check_vlen_dtype(dataset.dtype) == np.uint8 and len(dataset.shape or ()) == 1
-    if not fits or 0 in dataset.shape:
+        layout = "(N,) of variable-length uint8"
+        fits = h5py.check_vlen_dtype(dataset.dtype) == np.uint8 and len(shape) == 1
+    if not fits or 0 in shape:
         return None, [f"{held}; write it as {layout}, or leave it out"]
     if num_states is not None and len(dataset) != num_states:
         return None, [
             f"dataset {name!r} has {len(dataset)} pictures, but the graph has {num_states} states;"
             f" write one per state, or leave it out"
         ]
-    if name == _RAW and max(dataset.shape[1:3]) > limits.MAX_PICTURE_SIDE:
-        return None, [f"{held}; make the pictures smaller, at most {limits.MAX_PICTURE_SIDE} pixels a side"]
     if name == _RAW:
-        return (dataset.shape[1], dataset.shape[2], 3), []
+        if max(shape[1:3]) > limits.MAX_PICTURE_SIDE:
+            most = limits.MAX_PICTURE_SIDE
+            return None, [f"{held}; make the pictures smaller, at most {most} pixels a side"]
+        return (shape[1], shape[2], 3), []
     try:
         height, width, _ = decode(dataset[0].tobytes()).shape
+        return (height, width, 3), []
     except OSError as error:
         return None, [f"dataset {name!r}, state 0: is unusable ({error}); write it again"]
-    return (height, width, 3), []
 
 
 def read_pictures(path: Path, ids: np.ndarray) -> np.ndarray:
-    """The pictures of some states; only these are read.
-
-    Args:
-        path: the scene's file.
-        ids: (n,) integers in any order, repeats allowed.
-
-    Returns:
-        (n, H, W, 3) uint8.
+    """Read the pictures of the states ``ids`` (n,), in any order, repeats allowed, as (n, H, W, 3) uint8.
 
     Raises:
         SceneError: the file has no pictures, a state is out of range, or a picture is damaged.

@@ -46,15 +46,14 @@ def step_length(location: Tensor) -> float:
 
 
 def spread_poses(location: Tensor, rotation: Tensor, count: int) -> list[int]:
-    """Select states whose poses lie far from one another, in place and in heading.
+    """Farthest-point selection of states, by place and heading, beginning nearest to the middle.
 
-    The first is the one nearest to the middle; each further one is the pose that is farthest from all before
-    it. Opposite headings count as far apart as half of the room.
+    Opposite headings count as far apart as half of the room.
 
     Args:
         location: (N, 2) metres.
         rotation: (N,) degrees.
-        count: how many; all of them when there are fewer.
+        count: number of states; all of them when there are fewer.
 
     Returns:
         state ids in the order of their choice, no repeats.

@@ -1,8 +1,7 @@
 """Provenance of a scene: who made it, with what, from which plan and seed, under which licences.
 
-These are attributes of the scene's file, one per field of :class:`Provenance`; unknown ones are
-left out. A scene carries them in :attr:`vusfa.scenes.Scene.attributes`, beside whatever else its maker wrote
-there.
+One attribute of the scene's file per field of :class:`Provenance`, in :attr:`vusfa.scenes.Scene.attributes`
+beside whatever else its maker wrote there.
 """
 
 from __future__ import annotations
@@ -27,9 +26,9 @@ class Provenance:
         made_with: tools and their versions, as :func:`this_tool` writes them.
         made_by: a person or a group.
         made_on: a day, 2026-11-23.
-        plan: the plan the room was built from, as its YAML text, or where it can be found.
+        plan: the room's plan as YAML text, or where it can be found.
         seed: of whatever was random.
-        licences: one line for each part that has a licence of its own.
+        licences: one line per part with a licence of its own.
         credits: whom to name wherever the pictures are shown.
 
     >>> origin = Provenance("vusfa 0.1.0 scenes from-photos", seed=3, credits=("Photographs: A. Fan",))
@@ -49,7 +48,7 @@ class Provenance:
 
     @classmethod
     def of(cls, attributes: Mapping[str, Any]) -> Provenance:
-        """Read the origin from a scene's attributes; files of other programs may have none.
+        """The origin in a scene's attributes, as far as they tell it.
 
         >>> Provenance.of({"seed": 1, "licences": "CC0", "exposure": 2.2})
         Provenance(made_with=None, ..., seed=1, licences=('CC0',), credits=())
@@ -63,12 +62,8 @@ class Provenance:
 
     def attributes(self) -> dict[str, Any]:
         """As attributes of a scene: ``Scene(..., attributes={**origin.attributes(), ...})``."""
-        written: dict[str, Any] = {}
-        for name in _NAMES:
-            value = getattr(self, name)
-            if value not in (None, ()):
-                written[name] = list(value) if isinstance(value, tuple) else value
-        return written
+        values = {name: getattr(self, name) for name in _NAMES}
+        return {k: list(v) if isinstance(v, tuple) else v for k, v in values.items() if v not in (None, ())}
 
     @staticmethod
     def other(attributes: Mapping[str, Any]) -> dict[str, Any]:
@@ -93,9 +88,7 @@ def this_tool(command: str, **versions: str) -> str:
 
 
 def today() -> str:
-    """A value for ``made_on``: the day in UTC; that of $SOURCE_DATE_EPOCH where it is set, for files that
-    come out the same every time.
-    """
+    """A value for ``made_on``: the day in UTC, or that of $SOURCE_DATE_EPOCH for reproducible files."""
     epoch = os.environ.get("SOURCE_DATE_EPOCH")
     moment = datetime.now(UTC) if epoch is None else datetime.fromtimestamp(int(epoch), UTC)
     return moment.strftime("%Y-%m-%d")

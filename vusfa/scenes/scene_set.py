@@ -1,6 +1,5 @@
-"""Several scenes as one space of state ids.
+"""Several scenes as one space of state ids: scene i has the ids ``offsets[i] .. offsets[i + 1] - 1``.
 
-A set numbers the states of its scenes consecutively: scene i has ``offsets[i] .. offsets[i + 1] - 1``.
 Environments and networks hold these integers and look everything else up here.
 """
 
@@ -88,7 +87,7 @@ class SceneSet:
 
     @classmethod
     def open(cls, scenes: str | os.PathLike[str] | Sequence[str | os.PathLike[str]]) -> SceneSet:
-        """Bundled names and files alike: ``SceneSet.open(["bathroom", "my_room.h5"])``.
+        """Open bundled names and files alike: ``SceneSet.open(["bathroom", "my_room.h5"])``.
 
         Scenes of one name, such as rooms of one kind from several seeds, are renamed after their files.
 
@@ -108,12 +107,12 @@ class SceneSet:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """The scenes' names, in the order of their ids."""
+        """Names of the scenes, in the order of their ids."""
         return tuple(scene.name for scene in self.scenes)
 
     @property
     def num_scenes(self) -> int:
-        """How many scenes there are."""
+        """Number of scenes."""
         return len(self.scenes)
 
     @property
@@ -148,7 +147,7 @@ class SceneSet:
 
     @property
     def distance_tables(self) -> tuple[Tensor, Tensor]:
-        """The scenes' N x N tables of shortest paths, row by row, one after the other, for frequent use.
+        """The scenes' tables (N, N) of shortest paths, flat, one after the other, for frequent use.
 
         Entry ``first[i] + s * N + g`` of the first tensor is the actions from s to g, in scene i's own ids;
         the second tensor is ``first``, (n_scenes + 1,). Shared, not copied.
@@ -156,14 +155,10 @@ class SceneSet:
         return self._distance, self._distance_start
 
     def distance(self, state: Any, goal: Any) -> Tensor:
-        """Fewest actions from states to goals.
-
-        Args:
-            state: global ids of any shape.
-            goal: global ids of a shape that broadcasts with it.
+        """Lengths of the shortest paths from states to goals, global ids of shapes that broadcast.
 
         Returns:
-            int64 of the broadcast shape; -1 where the goal is unreachable or in another scene.
+            int64 of the broadcast shape, in actions; -1 where the goal is unreachable or in another scene.
         """
         state = torch.as_tensor(state, dtype=torch.int64, device=self.device)
         goal = torch.as_tensor(goal, dtype=torch.int64, device=self.device)
@@ -176,7 +171,7 @@ class SceneSet:
         return torch.where(same, found, -1)
 
     def scene_index(self, scene: str | int) -> int:
-        """Index of a scene by its name (or its index, which is checked).
+        """Index of a scene by its name, or its index checked.
 
         Raises:
             SceneError: there is no such scene.
@@ -190,11 +185,7 @@ class SceneSet:
         return int(scene)
 
     def global_id(self, scene: str | int, local: Any) -> Tensor:
-        """Global ids of a scene's own state ids.
-
-        Args:
-            scene: name or index.
-            local: state ids of any shape, as in the scene's file.
+        """Global ids of local state ids, of any shape, of a scene, given by name or index.
 
         Raises:
             SceneError: there is no such scene or state.
@@ -214,7 +205,7 @@ class SceneSet:
         return ids + self.offsets[index]
 
     def local_id(self, ids: Any) -> Tensor:
-        """The scenes' own ids of global ids of any shape; the inverse of :meth:`global_id`.
+        """Local ids of global ids of any shape; the inverse of :meth:`global_id`.
 
         >>> SceneSet.bundled().local_id([0, 176, 179]).tolist()
         [0, 0, 3]
@@ -223,7 +214,7 @@ class SceneSet:
         return ids - self.offsets[self.scene_id[ids]]
 
     def pictures(self, ids: Any) -> Tensor:
-        """Pictures of states by global id, read from the scenes' files now.
+        """Pictures of states, read from the scenes' files now.
 
         Args:
             ids: global ids of any shape.
@@ -255,7 +246,7 @@ class SceneSet:
         return torch.from_numpy(result).reshape(*ids.shape, *result.shape[1:])
 
     def to(self, device: torch.device | str) -> SceneSet:
-        """The same set with its tables on a device; the scenes themselves stay on the CPU."""
+        """The same set with its tables on a device; the scenes stay on the CPU."""
         moved = object.__new__(SceneSet)
         for name, value in vars(self).items():
             setattr(moved, name, value.to(device) if isinstance(value, Tensor) else value)

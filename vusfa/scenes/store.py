@@ -25,8 +25,17 @@ import numpy as np
 
 from vusfa.deprecated import moved_names
 from vusfa.errors import SceneError
+from vusfa.limits import MAX_NAME, brief
 from vusfa.scenes import pictures as picture_files
-from vusfa.scenes.hdf5 import check_heaps, copy_others, dataset_in, opened, plain, read_distances, replaced
+from vusfa.scenes.hdf5 import (
+    check_heaps,
+    copy_others,
+    dataset_in,
+    opened,
+    read_attributes,
+    read_distances,
+    replaced,
+)
 from vusfa.scenes.validation import DATASETS, array_faults
 
 __all__ = ["Dump", "bundled_names", "bundled_path", "read", "validate", "write"]
@@ -36,11 +45,11 @@ _BUNDLED = Path(__file__).parent / "bundled"
 
 @dataclass
 class Dump:
-    """What one scene file holds, but for its pictures, unchecked.
+    """Content of a scene file except its pictures, unchecked.
 
     Attributes:
         name: attribute ``scene``, or the file's stem.
-        arrays: the numeric datasets by name, those that are there and can be read.
+        arrays: the numeric datasets by name, as far as they can be read.
         actions: attribute ``actions``, or None.
         attributes: all other attributes as plain Python values.
         picture_shape: (H, W, 3), or None without usable pictures.
@@ -84,7 +93,7 @@ def bundled_path(name: str) -> Path:
 
 
 def read(path: str | os.PathLike[str]) -> Dump:
-    """Everything but the pictures; what is wrong with it is collected, not raised.
+    """Read everything but the pictures; faults are collected, not raised.
 
     Raises:
         SceneError: the file is missing or cannot be opened as HDF5.
@@ -94,9 +103,13 @@ def read(path: str | os.PathLike[str]) -> Dump:
     """
     path = Path(path)
     with opened(path) as file:
-        check_heaps(path)
-        attributes = {key: plain(value) for key, value in file.attrs.items()}
+        attributes = read_attributes(file, check_heaps(path))
         dump = Dump(name=str(attributes.pop("scene", path.stem)))
+        if len(dump.name) > MAX_NAME or not dump.name.isprintable():
+            dump.reading_faults.append(
+                f"attribute 'scene' is {brief(dump.name)}; give a name of at most {MAX_NAME} printable"
+                f" characters"
+            )
         if "actions" in attributes:
             dump.actions = tuple(str(action) for action in np.atleast_1d(attributes.pop("actions")))
         dump.attributes = attributes
@@ -118,9 +131,9 @@ def read(path: str | os.PathLike[str]) -> Dump:
 
 
 def validate(path: str | os.PathLike[str]) -> list[str]:
-    """All faults of a scene file at once, every picture looked at; an empty list for a sound file.
+    """All faults of a scene file at once, every picture decoded; an empty list for a sound file.
 
-    Each line names the file, the dataset and the state, and the mend.
+    Each line names the file, the dataset, the state and the mend.
 
     >>> validate(bundled_path("bathroom"))
     []

@@ -1,9 +1,8 @@
 """Validation of a scene's arrays.
 
-Pure functions of arrays, each of which returns a list of faults: one line per kind of fault, naming the
-dataset, the first state concerned, how many there are and how to correct it. An empty list means that the
-scene can be used. Islands (states that some others cannot reach) are no fault;
-:attr:`vusfa.scenes.Scene.islands` reports them.
+Pure functions that return lists of faults, one line per kind: the dataset, the first state concerned, how
+many there are, and the mend. Islands (states that some others cannot reach) are no fault, see
+:attr:`vusfa.scenes.Scene.islands`.
 """
 
 from __future__ import annotations
@@ -67,12 +66,7 @@ def _how_many(count: int) -> str:
 
 
 def shape_fault(name: str, values: np.ndarray, num_states: int) -> str | None:
-    """The fault of a dataset whose dtype or shape does not fit; None when they do.
-
-    Args:
-        name: one of :data:`DATASETS`.
-        values: the dataset.
-        num_states: N, as the graph has it.
+    """The fault of a dataset, one of :data:`DATASETS`, whose dtype or shape does not fit N states; or None.
 
     >>> shape_fault("graph", np.zeros((3, 4), np.float32), 3)
     "dataset 'graph' holds float32 of shape (3, 4); write it as integers (N, A)"
@@ -93,7 +87,7 @@ def shape_fault(name: str, values: np.ndarray, num_states: int) -> str | None:
 
 
 def graph_faults(graph: np.ndarray, actions: Sequence[str] | None = None) -> list[str]:
-    """Successors that are neither a state nor -1, and names of actions that do not fit the columns.
+    """Successors that are neither a state nor -1; action names that do not fit the columns.
 
     >>> graph_faults(np.array([[1, -1], [7, 0]]))[0]
     "dataset 'graph', state 1: action 0 leads to 7, but states are 0..1 (-1 is a blocked move); correct it"
@@ -201,7 +195,7 @@ def array_faults(
     actions: Sequence[str] | None = None,
     optional: Collection[str] = (),
 ) -> list[str]:
-    """All faults of a scene's arrays at once; values are looked at where the shapes allow it.
+    """All faults of a scene's arrays at once.
 
     Args:
         arrays: the datasets of :data:`DATASETS` by name.
