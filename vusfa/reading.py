@@ -161,12 +161,10 @@ def check_fields(
 def read_csv(
     path: str | os.PathLike[str], error: type[VusfaError], mend: str, words: Collection[str] = ()
 ) -> dict[str, Any]:
-    """Read a CSV file of numbers.
+    """Read a CSV file of numbers whose first line names the columns.
 
     Args:
-        path: the file; its first line names the columns.
-        error: class of the exception, for whatever is wrong with the file.
-        mend: end of its message.
+        path, error, mend: see :func:`read_text`.
         words: columns that hold text.
 
     Returns:
@@ -282,13 +280,7 @@ def _read_array(file: BinaryIO, size: int) -> np.ndarray:
 
 
 def read_npy(path: str | os.PathLike[str], error: type[VusfaError], mend: str) -> np.ndarray:
-    """The array of a .npy file: numbers, truth values or text, no pickles.
-
-    Args:
-        path: the file.
-        error: class of the exception, for whatever is wrong with the file.
-        mend: end of its message.
-    """
+    """Read a .npy file of numbers, truth values or text, no pickles; see :func:`read_text`."""
     try:
         if os.path.exists(path) and not os.path.isfile(path):
             raise OSError("it is no regular file")

@@ -88,9 +88,7 @@ def check_heaps(path: Path) -> int:
 def read_attributes(file: h5py.File, largest: int) -> dict[str, Any]:
     """The attributes of a file as plain values.
 
-    Args:
-        file: an open file.
-        largest: bytes of its largest text, see :func:`check_heaps`; entries can share one.
+    Entries can share a text: each may have the bytes of the ``largest``, see :func:`check_heaps`.
 
     Raises:
         OSError: an attribute declares more than :data:`vusfa.limits.MAX_ATTRIBUTE_BYTES`.
@@ -173,8 +171,7 @@ def copy_others(source: Path, target: h5py.File, known: Collection[str], stale: 
     Args:
         source: the file.
         target: an open file with its own datasets.
-        known: names of datasets of a scene.
-        stale: datasets with new content, whose attributes are not copied.
+        known: names of a scene's datasets; of those in ``stale``, with new content, no attributes are copied.
 
     Raises:
         SceneError: something cannot be copied.

@@ -26,7 +26,6 @@ __all__ = [
     "decode",
     "look",
     "open_image",
-    "picture_faults",
     "raw_blocks",
     "read_pictures",
     "stored",
@@ -165,16 +164,6 @@ def raw_blocks(path: Path, num_states: int) -> Iterator[np.ndarray]:
     at_once = max(1, min(_AT_ONCE, limits.MAX_PICTURE_BYTES // max(size, 1)))
     for first in range(0, num_states, at_once):
         yield read_pictures(path, np.arange(first, min(first + at_once, num_states)))
-
-
-def picture_faults(path: Path, num_states: int) -> list[str]:
-    """Decode every picture; the first fault among them, or an empty list."""
-    try:
-        for _ in raw_blocks(path, num_states):
-            pass
-    except SceneError as error:
-        return [str(error)]
-    return []
 
 
 def stored(path: Path, num_states: int) -> tuple[list[bytes] | None, Iterator[np.ndarray] | None]:

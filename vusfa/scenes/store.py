@@ -147,7 +147,11 @@ def validate(path: str | os.PathLike[str]) -> list[str]:
         return [str(error)]
     faults = [f"{path}: {fault}" for fault in dump.faults()]
     if dump.picture_shape is not None and "graph" in dump.arrays and dump.arrays["graph"].ndim:
-        faults += picture_files.picture_faults(path, len(dump.arrays["graph"]))
+        try:
+            for _ in picture_files.raw_blocks(path, len(dump.arrays["graph"])):
+                pass
+        except SceneError as error:
+            faults.append(str(error))
     return faults
 
 
