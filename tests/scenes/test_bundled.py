@@ -16,7 +16,7 @@ from vusfa.scenes import Scene, SceneSet, bundled_names, validate
 from vusfa.scenes.store import bundled_path
 
 _ROOT = Path(__file__).parents[2]
-_LIMIT = 25_000_000
+_LIMIT = 30_000_000
 
 
 @pytest.mark.parametrize("name", ["bathroom", "bedroom", "kitchen", "living_room"])
@@ -84,6 +84,7 @@ sys.path.insert(0, {str(alone)!r})
 import vusfa.scenes
 rooms = vusfa.scenes.SceneSet.bundled()
 print(vusfa.scenes.__file__, rooms.num_states, tuple(rooms.pictures([0, 1711]).shape), rooms.fingerprint)
+print(vusfa.load_pretrained("vusfa", rooms).agent.config["model"])
 """
     elsewhere = tmp_path / "elsewhere"
     elsewhere.mkdir()
@@ -96,5 +97,5 @@ print(vusfa.scenes.__file__, rooms.num_states, tuple(rooms.pictures([0, 1711]).s
     )
     assert done.returncode == 0, done.stderr
     rooms = SceneSet.bundled()
-    expected = f"{alone}/vusfa/scenes/__init__.py 1712 (2, 150, 200, 3) {rooms.fingerprint}\n"
+    expected = f"{alone}/vusfa/scenes/__init__.py 1712 (2, 150, 200, 3) {rooms.fingerprint}\nvusfa\n"
     assert done.stdout == expected
