@@ -32,6 +32,7 @@ class Suite(StrEnum):
     collect = "collect"
     update = "update"
     solve = "solve"
+    precision = "precision"
     memory = "memory"
     eval = "eval"
     gpu = "gpu"
@@ -45,6 +46,7 @@ MODULES: dict[str, tuple[str, ...]] = {
     "collect": ("collect_suite",),
     "update": ("update_suite",),
     "solve": ("solve_suite",),
+    "precision": ("precision_suite",),
     "memory": ("memory_suite",),
     "eval": ("eval_suite",),
     "gpu": ("gpu_suite",),

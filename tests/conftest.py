@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 import h5py
+import hypothesis
 import numpy as np
 import pytest
 import torch
@@ -28,6 +29,10 @@ from vusfa.sources.render.catalogue import Catalogue
 # the tests say of interruptions shall hold there, too.
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
+
+# An example takes longer on a busy machine: no property test has a deadline.
+hypothesis.settings.register_profile("vusfa", deadline=None)
+hypothesis.settings.load_profile("vusfa")
 
 _RECORDED = Path(__file__).parent / "golden"
 

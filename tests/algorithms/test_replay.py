@@ -47,7 +47,7 @@ def filled(capacity: int, ends: dict[int, set[int]], **options: float) -> Hindsi
     st.sampled_from([3, 12, 30, 60, 63, 119, 120, 500]),
     st.integers(1, 12),
 )
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 def test_goals_of_the_own_way_lie_on_it(ends: dict[int, set[int]], capacity: int, horizon: int):
     sample = filled(capacity, ends, horizon=horizon, own_future=1.0).sample()
     state, goal, steps = sample["state_id"][:, -1], sample["goal_id"], sample["steps_to_goal"]

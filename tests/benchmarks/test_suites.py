@@ -37,6 +37,7 @@ PROMISED = {
         "time to solve, SB3 A2C",
         "time to solve, SB3 PPO",
     ],
+    "precision_suite": [r"updates, AVX2 alone \(imitated\), autocast=auto"],
     "eval_suite": ["zero-shot evaluation, .*one episode at a time"],
     "memory_suite": [
         "collector: a frame as ids",

@@ -142,7 +142,7 @@ def test_the_numbers_of_controlled(settings):
     }
     assert cfg.env.goal_sampling == "episode"
     assert cfg.entropy == {"start": 0.005, "end": 0.001, "horizon": 6_000_000}
-    assert (cfg.total_frames, cfg.autocast) == (6_000_000, True)
+    assert (cfg.total_frames, cfg.autocast) == (6_000_000, "auto")
 
 
 @pytest.mark.parametrize("preset", ["controlled", "paper", "reference"])

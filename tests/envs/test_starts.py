@@ -44,7 +44,7 @@ def graphs(draw: st.DrawFn) -> list[list[list[int]]]:
     return scenes
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=150)
 @given(graphs())
 def test_every_start_and_no_other_equally_often(graphs: list[list[list[int]]]) -> None:
     """Drawing k times the number of starts, one integer after the other, meets each exactly k times."""
@@ -64,7 +64,7 @@ def test_every_start_and_no_other_equally_often(graphs: list[list[list[int]]]) -
         first += len(graph)
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 @given(graphs())
 def test_all_goals_together_are_as_each_alone(graphs: list[list[list[int]]]) -> None:
     first, goals, expected = 0, [], []

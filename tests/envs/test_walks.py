@@ -132,7 +132,7 @@ def check_begun(
         agents[row].begin(flat["state_id"][row].tolist(), goal)
 
 
-@settings(max_examples=70, deadline=None)
+@settings(max_examples=70)
 @given(st.data())
 def test_every_step_reset_mask_time_out_and_collision(data: st.DataObject) -> None:
     graphs, actions = data.draw(worlds())

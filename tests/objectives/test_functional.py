@@ -116,7 +116,7 @@ class TestLambdaReturn:
         torch.testing.assert_close(moved.transpose(0, 1), expected)
 
     @given(data=st.data(), steps=st.integers(1, 7), gamma=st.floats(0, 1), lmbda=st.floats(0, 1))
-    @settings(max_examples=60, deadline=None)
+    @settings(max_examples=60)
     def test_equals_the_definition(self, data: st.DataObject, steps: int, gamma: float, lmbda: float) -> None:
         numbers = st.lists(st.floats(-5, 5), min_size=steps, max_size=steps)
         cumulant, next_value = data.draw(numbers), data.draw(numbers)

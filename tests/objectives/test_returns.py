@@ -92,7 +92,7 @@ class TestTargets:
         lmbda=st.sampled_from([0.0, 0.3, 0.95, 1.0]),
         bootstrap_at_timeout=st.booleans(),
     )
-    @settings(max_examples=80, deadline=None)
+    @settings(max_examples=80)
     def test_equal_a_plain_transcription(self, batch, seed, ends, gamma, lmbda, bootstrap_at_timeout) -> None:
         td = table_rollout(*batch, seed=seed, ends=ends)
         critic = table_critic()

@@ -8,7 +8,7 @@ import networkx as nx
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from vusfa.errors import GoalError
@@ -94,7 +94,6 @@ def test_blocked_moves_stay_in_place(table: np.ndarray) -> None:
         assert blocked[state].tolist() == [target < 0 for target in row]
 
 
-@settings(deadline=None)
 @given(random_graphs(max_states=7), st.integers(0, 12))
 def test_random_walk_is_that_of_the_transcription(table: np.ndarray, steps: int) -> None:
     num_states = len(table)
@@ -104,7 +103,6 @@ def test_random_walk_is_that_of_the_transcription(table: np.ndarray, steps: int)
     np.testing.assert_allclose(found.numpy(), expected, rtol=0, atol=1e-12)
 
 
-@settings(deadline=None)
 @given(random_graphs(max_states=7), st.integers(0, 12), st.integers(0, 1000))
 def test_policy_success_is_that_of_the_transcription(table: np.ndarray, steps: int, seed: int) -> None:
     rng = np.random.default_rng(seed)

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from vusfa.errors import SceneError
@@ -37,7 +37,6 @@ def rooms() -> SceneSet:
     return SceneSet.bundled()
 
 
-@settings(deadline=None)
 @given(st.lists(st.integers(1, 8), min_size=1, max_size=4), st.integers(0, 1000))
 def test_tables_are_those_of_the_scenes_one_after_the_other(sizes: list[int], seed: int) -> None:
     rng = np.random.default_rng(seed)

@@ -15,6 +15,8 @@ def test_facts_of_a_checkpoint() -> None:
             "hindsight": {"updates": 0},
             "seed": 4,
             "threads": 1,
+            "autocast": True,
+            "device": "cpu",
         },
         "scenes": {"names": ["hall"], "fingerprint": "abc"},
         "goals": torch.tensor([3, 5]),
@@ -26,7 +28,7 @@ def test_facts_of_a_checkpoint() -> None:
     wanted = {"model": "usfa", "row": "usfa", "seed": 4, "trained_goals": [3, 5], "frames": 1280}
     assert {key: facts[key] for key in wanted} == wanted
     assert facts["training_s"] == pytest.approx(2.3)
-    assert facts["overrides"] == ["seed=4"]
+    assert (facts["overrides"], facts["precision"]) == (["seed=4"], "bfloat16")
 
 
 def test_facts_of_the_machine() -> None:

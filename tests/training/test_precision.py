@@ -6,13 +6,17 @@ import os
 import subprocess
 import sys
 import time
+from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
+from omegaconf import OmegaConf
 
 from vusfa.errors import ConfigError
-from vusfa.training import precision
-from vusfa.training.precision import describe_autocast, resolve_autocast
+from vusfa.experiments.training import compose_settings
+from vusfa.training import Trainer, load_checkpoint, make_trainer, precision, run_facts
+from vusfa.training.precision import resolve_autocast
 
 
 @pytest.fixture(autouse=True)
@@ -100,9 +104,35 @@ def test_any_other_setting_is_refused(setting: object) -> None:
         resolve_autocast(setting)  # type: ignore[arg-type]
 
 
-def test_the_run_says_its_precision(monkeypatch: pytest.MonkeyPatch) -> None:
-    has_units(monkeypatch, avx512_bf16=False)
-    assert describe_autocast("auto") == "float32 (autocast=auto: bfloat16 is no faster on this cpu)"
+@pytest.mark.parametrize("faster", [True, False])
+def test_a_training_keeps_what_auto_meant_at_its_start(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, scene_file: Path, faster: bool
+) -> None:
+    """Another machine's answer changes nothing in a resumed run; true and false do."""
+    small = [
+        f"scenes=[{scene_file}]",
+        "agent.hidden_size=8",
+        "agent.embedding_size=8",
+        "collector.num_envs=5",
+        f"folder={tmp_path}",
+    ]
+
+    def made(*overrides: str) -> Trainer:
+        settings: Any = OmegaConf.to_container(compose_settings([*small, "collector.rollout=4", *overrides]))
+        return make_trainer(settings)
+
     has_units(monkeypatch, amx_bf16=True)
-    takes(monkeypatch, bfloat16=0.1)
-    assert describe_autocast("auto") == "bfloat16 (autocast=auto: bfloat16 is faster on this cpu)"
+    takes(monkeypatch, bfloat16=0.1 if faster else 10.0)
+    trainer = made()
+    assert trainer.settings["autocast"] is faster
+    with trainer.collecting():
+        path = trainer.save(tmp_path / "checkpoint.pt")
+    assert load_checkpoint(path)["config"]["autocast"] is faster
+    assert run_facts(load_checkpoint(path))["precision"] == ("bfloat16" if faster else "float32")
+    monkeypatch.setattr(precision, "_is_faster", lambda: not faster)
+    assert resolve_autocast("auto") is not faster
+    resumed = made(f"resume={path}")
+    assert resumed.settings["autocast"] is faster
+    assert resumed.resume(path) == []
+    for setting in (True, False):
+        assert made(f"resume={path}", f"autocast={str(setting).lower()}").settings["autocast"] is setting

@@ -16,6 +16,7 @@ __all__ = [
     "POSITIVE",
     "AgentSettings",
     "CollectorSettings",
+    "EarlyStoppingSettings",
     "EntropySettings",
     "EnvSettings",
     "EvaluationSettings",
@@ -39,6 +40,7 @@ POSITIVE = (
     "optim.horizon",
     "entropy.horizon",
     "collector.timeout",
+    *(f"early_stopping.{name}" for name in ("success", "every", "episodes_per_goal", "max_steps")),
 )
 
 
@@ -171,6 +173,16 @@ class EntropySettings:
 
 
 @dataclass
+class EarlyStoppingSettings:
+    """When a training ends before ``total_frames``; success null: never."""
+
+    success: float | None
+    every: int
+    episodes_per_goal: int
+    max_steps: int
+
+
+@dataclass
 class Settings:
     """All settings of a training.
 
@@ -189,6 +201,7 @@ class Settings:
     logger: LoggerSettings
     evaluation: EvaluationSettings
     entropy: EntropySettings
+    early_stopping: EarlyStoppingSettings
     scenes: Any
     seed: int
     name: str

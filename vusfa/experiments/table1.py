@@ -20,8 +20,13 @@ __all__ = ["checkpoints", "table1"]
 
 
 def checkpoints(folder: Path, overrides: list[str], stages: list[float]) -> list[Path]:
-    """Train up to each stage and keep a checkpoint there; existing ones are kept."""
+    """Train up to each stage and keep a checkpoint there; existing ones are kept.
+
+    With ``early_stopping.success`` the only checkpoint is the one that the training ended with.
+    """
     cfg = compose_settings([*overrides, f"folder={folder}", "evaluation=none"])
+    if cfg.early_stopping.success is not None:
+        stages = stages[-1:]
     # interpolated now: schedules end where the whole training ends, whichever part of it runs
     total, last = cfg.total_frames, folder / "checkpoint.pt"
     kept = [folder / f"checkpoint-{round(100 * stage)}.pt" for stage in stages]

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack, suppress
+from functools import partial
 from typing import Any, NamedTuple
 
 from omegaconf import DictConfig, OmegaConf
 
 from vusfa.conf.compose import compose
 from vusfa.conf.schema import register_schema
-from vusfa.evaluation import Comparison, check_comparison, compare, print_summary
+from vusfa.evaluation import Comparison, check_comparison, compare, evaluate, print_summary
+from vusfa.experiments.measure import evaluation_policy, evaluation_precision
 from vusfa.files import say
 from vusfa.training import (
     EvaluationProgress,
@@ -25,6 +27,8 @@ from vusfa.training import (
     set_threads,
 )
 from vusfa.training.folder import AUTO, CHECKPOINT, found_checkpoint
+from vusfa.training.precision import describe_autocast
+from vusfa.training.setup import decide_autocast
 
 __all__ = ["Trained", "compose_settings", "train"]
 
@@ -69,15 +73,16 @@ def train(settings: Mapping[str, Any], overrides: Sequence[str] = ()) -> Trained
         plain["resume"] = found_checkpoint(plain["folder"])
     set_threads(plain["threads"])
     folder = RunFolder(plain["folder"], plain)
+    decided, plain["autocast"] = plain["autocast"] == "auto", decide_autocast(plain)
     trainer = make_trainer(plain, overrides)
-    if trainer.note is not None:
-        say(trainer.note)
     evaluated = plain["evaluation"]["goals"]
     if evaluated:
         check_comparison(trainer.scenes, **_evaluation(trainer))
-    if plain["resume"]:
-        for change in trainer.resume(plain["resume"]):
-            say(f"resumed with {change}")
+    changes = trainer.resume(plain["resume"]) if plain["resume"] else []
+    notes = [] if trainer.note is None else [trainer.note]
+    precision = describe_autocast(plain["autocast"], decided=decided)
+    for line in (precision, *notes, *(f"resumed with {change}" for change in changes)):
+        say(line)
     with ExitStack() as stack:
         stack.enter_context(folder)
         plain["folder"] = str(folder.path)
@@ -91,7 +96,9 @@ def train(settings: Mapping[str, Any], overrides: Sequence[str] = ()) -> Trained
             )
         )
         with StopOnSignal() as stop, ProgressLine(plain["total_frames"]) as progress:
-            run_training(trainer, folder.path / CHECKPOINT, loggers, stop, progress)
+            stops_early = plain["early_stopping"]["success"] is not None
+            converged = partial(_converged, trainer) if stops_early else None
+            run_training(trainer, folder.path / CHECKPOINT, loggers, stop, progress, converged)
         loggers.exit_code = stop.exit_code
         comparison = None
         if evaluated and not stop.received:
@@ -101,6 +108,28 @@ def train(settings: Mapping[str, Any], overrides: Sequence[str] = ()) -> Trained
             with suppress(BrokenPipeError):
                 print_summary(comparison.rows, note=comparison.note)
     return Trained(trainer, comparison, stop.exit_code)
+
+
+def _converged(trainer: Trainer) -> bool:
+    """Whether enough of the episodes to the trained goals arrive; prints how many."""
+    chosen = trainer.settings["early_stopping"]
+    with evaluation_precision(trainer.agent, trainer.settings):
+        episodes = evaluate(
+            evaluation_policy(trainer.agent),
+            trainer.scenes,
+            trainer.goals,
+            episodes_per_goal=chosen["episodes_per_goal"],
+            max_steps=chosen["max_steps"],
+            history=trainer.agent.config["history"],
+            seed=trainer.frames,
+            observe=trainer.observation,
+        )
+    success = episodes.success.double().mean().item()
+    say(
+        f"after {trainer.frames:,} frames {100 * success:.1f} % of the episodes to the trained goals arrive"
+        f" within {chosen['max_steps']} steps"
+    )
+    return success >= chosen["success"]
 
 
 def _evaluation(trainer: Trainer) -> dict[str, Any]:

@@ -10,6 +10,7 @@ from typing import Any
 
 import torch
 
+from vusfa.training.precision import precision_name, resolve_autocast
 from vusfa.training.setup import row_name
 
 __all__ = ["machine_facts", "run_facts"]
@@ -51,6 +52,7 @@ def run_facts(state: Mapping[str, Any], overrides: Sequence[str] = ()) -> dict[s
         "updates": int(state["updates"]),
         "training_s": round(float(state["seconds"]), 1),
         "threads": config["threads"],
+        "precision": precision_name(resolve_autocast(config["autocast"], config["device"])),
         **machine_facts(),
     }
 

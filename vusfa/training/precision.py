@@ -16,7 +16,7 @@ from torch import Tensor
 
 from vusfa.errors import ConfigError
 
-__all__ = ["describe_autocast", "resolve_autocast"]
+__all__ = ["describe_autocast", "precision_name", "resolve_autocast"]
 
 #: Rows, inputs and outputs of the product that is measured: a small batch through one of the paper's layers.
 PRODUCT = (256, 512, 512)
@@ -55,17 +55,22 @@ def resolve_autocast(setting: bool | Literal["auto"], device: torch.device | str
     return kind == "cpu" and _has_bfloat16_units() and _is_faster()
 
 
-def describe_autocast(setting: bool | Literal["auto"], device: torch.device | str = "cpu") -> str:
-    """The precision of a run, in a few words for its first line.
+def describe_autocast(enabled: bool, *, decided: bool) -> str:
+    """The precision of a run, as its first line.
 
-    >>> describe_autocast(False), describe_autocast(True)
-    ('float32', 'bfloat16')
+    Args:
+        enabled: whether products are computed in bfloat16.
+        decided: by ``autocast=auto``: at the start of the training, which a resumed run keeps.
+
+    >>> describe_autocast(False, decided=False), describe_autocast(True, decided=True)
+    ('products in float32', 'products in bfloat16 (autocast=auto)')
     """
-    precision = "bfloat16" if resolve_autocast(setting, device) else "float32"
-    if isinstance(setting, bool):
-        return precision
-    faster = "faster" if precision == "bfloat16" else "no faster"
-    return f"{precision} (autocast=auto: bfloat16 is {faster} on this {torch.device(device).type})"
+    return f"products in {precision_name(enabled)}{' (autocast=auto)' if decided else ''}"
+
+
+def precision_name(enabled: bool) -> str:
+    """The number format of the products."""
+    return "bfloat16" if enabled else "float32"
 
 
 def _has_bfloat16_units() -> bool:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from tensordict import TensorDictBase
@@ -17,9 +17,14 @@ __all__ = ["run_training"]
 
 
 def run_training(
-    trainer: Trainer, checkpoint: Path, loggers: Logger, stop: StopOnSignal, progress: ProgressLine
+    trainer: Trainer,
+    checkpoint: Path,
+    loggers: Logger,
+    stop: StopOnSignal,
+    progress: ProgressLine,
+    converged: Callable[[], bool] | None = None,
 ) -> None:
-    """Updates until ``total_frames`` or a signal, with lines of the log and checkpoints.
+    """Updates until ``total_frames``, convergence or a signal, with lines of the log and checkpoints.
 
     Args:
         trainer: new, or resumed.
@@ -27,6 +32,7 @@ def run_training(
         loggers: get metrics and checkpoints.
         stop: looked at after each update.
         progress: the live line.
+        converged: asked every ``early_stopping.every`` frames whether the training may end.
 
     Raises:
         WorkerError, ResultError: a worker has died, or the system does not take a file. What was learned is
@@ -34,7 +40,7 @@ def run_training(
     """
     with trainer.collecting() as batches:
         try:
-            _run(trainer, batches, checkpoint, loggers, stop, progress)
+            _run(trainer, batches, checkpoint, loggers, stop, progress, converged)
         except (WorkerError, ResultError) as error:
             if not (stop.received and isinstance(error, WorkerError)):
                 raise _with_whereabouts(error, trainer, checkpoint) from error
@@ -48,14 +54,18 @@ def _run(
     loggers: Logger,
     stop: StopOnSignal,
     progress: ProgressLine,
+    converged: Callable[[], bool] | None,
 ) -> None:
     total, log_every = trainer.settings["total_frames"], trainer.settings["log_every"]
     checkpoint_every = trainer.settings["checkpoint_every"]
-    while trainer.frames < total and not stop.received:
+    every, ended = trainer.settings["early_stopping"]["every"] if converged else total, False
+    while trainer.frames < total and not stop.received and not ended:
         before = trainer.frames
         trainer.update(batches)
         progress.update(trainer.frames)
         ended = trainer.frames >= total  # a short training is logged, too
+        if converged is not None and not ended and before // every < trainer.frames // every:
+            ended = converged()
         if ended or before // log_every < trainer.frames // log_every:
             metrics = trainer.metrics()
             loggers.log_metrics(metrics, trainer.frames)

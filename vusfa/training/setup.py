@@ -15,6 +15,7 @@ from vusfa.envs import SceneObservation, resolve_goals
 from vusfa.errors import ConfigError
 from vusfa.modules import Agent, make_agent
 from vusfa.scenes import SceneSet
+from vusfa.training.checkpoint import load_checkpoint
 from vusfa.training.collectors import check_goals_dealt, make_collector, make_env
 from vusfa.training.memory import keep_memory
 from vusfa.training.optimization import make_optimizer
@@ -22,7 +23,7 @@ from vusfa.training.precision import resolve_autocast
 from vusfa.training.trainer import Trainer
 from vusfa.training.upgrade import upgrade_config
 
-__all__ = ["make_observation", "make_trainer", "row_name", "set_threads", "torch_device"]
+__all__ = ["decide_autocast", "make_observation", "make_trainer", "row_name", "set_threads", "torch_device"]
 
 
 def make_trainer(
@@ -40,6 +41,8 @@ def make_trainer(
     """
     torch.manual_seed(settings["seed"])
     device, optim = torch_device(settings["device"]), settings["optim"]
+    if not isinstance(settings["autocast"], bool):
+        settings = {**settings, "autocast": decide_autocast(settings)}
     scenes = SceneSet.open(settings["scenes"]) if scenes is None else scenes
     goals = resolve_goals(scenes, settings["env"]["goals"])
     check_goals_dealt(len(goals), settings["collector"]["num_envs"], settings["env"]["goal_sampling"])
@@ -65,7 +68,7 @@ def make_trainer(
             make_env=env,
             policy=policy,
             seed=settings["seed"],
-            autocast=resolve_autocast(settings["autocast"], device),
+            autocast=settings["autocast"],
             **settings["collector"],
         )
 
@@ -81,6 +84,24 @@ def make_trainer(
         observation=observation,
         note=note,
     )
+
+
+def decide_autocast(settings: Mapping[str, Any]) -> bool:
+    """Whether to compute in bfloat16; a resumed training goes on as it began unless told otherwise.
+
+    Args:
+        settings: as in vusfa/conf/train.yaml, plain and resolved.
+
+    Raises:
+        VusfaError: a setting that makes no sense, a device or a checkpoint that cannot be used.
+
+    >>> decide_autocast({"autocast": False, "device": "cpu"})
+    False
+    """
+    setting = settings["autocast"]
+    if setting == "auto" and settings["resume"]:
+        setting = load_checkpoint(settings["resume"])["config"]["autocast"]
+    return resolve_autocast(setting, torch_device(settings["device"]))
 
 
 def make_observation(agent: Agent, scenes: SceneSet, crop: str = "first") -> SceneObservation | None:
