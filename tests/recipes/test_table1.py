@@ -14,6 +14,7 @@ from vusfa.envs import resolve_goals
 from vusfa.experiments.manifest import make_manifest, write_manifest
 from vusfa.experiments.runs import read_run, read_runs, write_run
 from vusfa.scenes import SceneSet
+from vusfa.training import load_checkpoint
 
 SMALL = [
     "preset=controlled",
@@ -94,3 +95,26 @@ def test_untrained_and_measured_again(table1: Any, folders: dict[str, Path]) -> 
     assert anew.info == cell.info
     for way, table in anew.episodes.items():
         assert table.equal(cell.episodes[way])
+
+
+@pytest.mark.parametrize(("share", "steps", "frames"), [(0.01, 500, 96), (1.0, 1, 160)])
+def test_a_training_ends_when_enough_goals_are_reached(
+    table1: Any, folders: dict[str, Path], share: float, steps: int, frames: int
+) -> None:
+    """At the first look, after 96 of 160 frames, or never; schedules end where they would have ended."""
+    stop = [f"early_stopping.{name}" for name in (f"success={share}", f"max_steps={steps}", "every=70")]
+    settings = [*SMALL, *stop, "early_stopping.episodes_per_goal=5", "optim.horizon=1000"]
+    table1.table1(settings, models=["gvf"], seeds=[0], **folders)
+    cell = read_run(folders["results"], "table1", "gvf-0")
+    assert (cell.info["frames"], cell.info["checkpoint"]) == (frames, "checkpoint-100.pt")
+    config = load_checkpoint(folders["runs"] / "table1" / "gvf-0" / "checkpoint.pt")["config"]
+    assert (config["total_frames"], config["optim"]["horizon"]) == (160, 1000)
+
+
+def test_looking_whether_to_end_changes_nothing(table1: Any, folders: dict[str, Path]) -> None:
+    weights = []
+    for number, looks in enumerate(([], ["early_stopping.success=1.0", "early_stopping.every=32"])):
+        changed = [*SMALL, *looks, "early_stopping.max_steps=1", "agent.history=2", "autocast=true"]
+        last = table1.checkpoints(folders["runs"] / str(number), changed, [1.0])[-1]
+        weights.append(load_checkpoint(last)["agent"])
+    assert all(torch.equal(weight, weights[1][name]) for name, weight in weights[0].items())

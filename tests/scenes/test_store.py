@@ -63,7 +63,7 @@ def the_fault(path: Path) -> str:
 # ---- round trips
 
 
-@settings(deadline=None, max_examples=40, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=40, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(data=st.data())
 def test_write_read_write_gives_the_same_bytes(tmp_path: Path, data: st.DataObject) -> None:
     sizes = st.integers(1, 6)

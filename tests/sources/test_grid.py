@@ -31,7 +31,7 @@ def rectangle(width: int, height: int, headings: list[float]) -> tuple[np.ndarra
     return np.array(location, float), np.array(headings * (width * height), float)
 
 
-@settings(deadline=None, max_examples=40)
+@settings(max_examples=40)
 @given(
     noise=st.sampled_from([0.0, 0.02]),
     frame=st.floats(-180, 180),

@@ -47,7 +47,7 @@ def test_structured_rows(tmp_path: Path) -> None:
     assert np.array_equal(RowLog(tmp_path / "log", {}, dtype).read(), record)
 
 
-@settings(deadline=None, max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(data=st.data())
 def test_torn_and_damaged_rows_are_dropped_with_all_that_follows(tmp_path: Path, data: st.DataObject) -> None:
     path = tmp_path / "log"

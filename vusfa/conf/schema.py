@@ -163,7 +163,9 @@ def _check_ranges(settings: Mapping[str, Any]) -> None:
             raise ConfigError(f"{name} is {value}; it must be more than 0")
     if (settings["early_stopping"]["success"] or 0) > 1:
         share = settings["early_stopping"]["success"]
-        raise ConfigError(f"early_stopping.success is {share}; it is a share of episodes, at most 1: give 0.9")
+        raise ConfigError(
+            f"early_stopping.success is {share}; it is a share of episodes, at most 1: give 0.9"
+        )
 
 
 def _type_of(name: str) -> tuple[Any, bool]:
