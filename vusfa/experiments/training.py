@@ -79,10 +79,6 @@ def train(settings: Mapping[str, Any], overrides: Sequence[str] = ()) -> Trained
     if evaluated:
         check_comparison(trainer.scenes, **_evaluation(trainer))
     changes = trainer.resume(plain["resume"]) if plain["resume"] else []
-    notes = [] if trainer.note is None else [trainer.note]
-    precision = describe_autocast(plain["autocast"], decided=decided)
-    for line in (precision, *notes, *(f"resumed with {change}" for change in changes)):
-        say(line)
     with ExitStack() as stack:
         stack.enter_context(folder)
         plain["folder"] = str(folder.path)
@@ -95,6 +91,10 @@ def train(settings: Mapping[str, Any], overrides: Sequence[str] = ()) -> Trained
                 **plain["logger"],
             )
         )
+        notes = [] if trainer.note is None else [trainer.note]
+        precision = describe_autocast(plain["autocast"], decided=decided)
+        for line in (precision, *notes, *(f"resumed with {change}" for change in changes)):
+            say(line)
         with StopOnSignal() as stop, ProgressLine(plain["total_frames"]) as progress:
             stops_early = plain["early_stopping"]["success"] is not None
             converged = partial(_converged, trainer) if stops_early else None

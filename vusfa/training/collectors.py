@@ -67,11 +67,11 @@ def make_env(scenes: SceneSet, transforms: Sequence[Transform] = (), **settings:
     return TransformedEnv(env, Compose(*(transform.clone() for transform in transforms)))
 
 
-def rows_per_worker(kind: str, num_envs: int, num_workers: int) -> int:
+def rows_per_worker(kind: str, num_envs: int, num_workers: int, rollout: int = 1) -> int:
     """Number of environments per worker.
 
     Raises:
-        ConfigError: unknown kind, or the environments cannot be shared out evenly.
+        ConfigError: unknown kind, no steps, or the environments cannot be shared out evenly.
 
     >>> rows_per_worker("multi_sync", num_envs=40, num_workers=2)
     20
@@ -83,6 +83,8 @@ def rows_per_worker(kind: str, num_envs: int, num_workers: int) -> int:
             f"collector.num_envs is {num_envs} and collector.num_workers {num_workers}; both must be 1 or"
             " more"
         )
+    if rollout < 1:
+        raise ConfigError(f"collector.rollout is {rollout}; it must be 1 or more")
     if kind == "single":
         return num_envs
     if num_envs % num_workers:
@@ -139,9 +141,7 @@ def make_collector(
         ConfigError: see :func:`rows_per_worker`.
         WorkerError: the workers cannot start.
     """
-    rows = rows_per_worker(kind, num_envs, num_workers)
-    if rollout < 1:
-        raise ConfigError(f"collector.rollout is {rollout}; it must be 1 or more")
+    rows = rows_per_worker(kind, num_envs, num_workers, rollout)
     shared: dict[str, Any] = {
         "total_frames": -1,
         "auto_register_policy_transforms": False,

@@ -16,7 +16,7 @@ from vusfa.errors import ConfigError
 from vusfa.modules import Agent, make_agent
 from vusfa.scenes import SceneSet
 from vusfa.training.checkpoint import load_checkpoint
-from vusfa.training.collectors import check_goals_dealt, make_collector, make_env
+from vusfa.training.collectors import check_goals_dealt, make_collector, make_env, rows_per_worker
 from vusfa.training.memory import keep_memory
 from vusfa.training.optimization import make_optimizer
 from vusfa.training.precision import resolve_autocast
@@ -46,6 +46,8 @@ def make_trainer(
     scenes = SceneSet.open(settings["scenes"]) if scenes is None else scenes
     goals = resolve_goals(scenes, settings["env"]["goals"])
     check_goals_dealt(len(goals), settings["collector"]["num_envs"], settings["env"]["goal_sampling"])
+    counts = ("kind", "num_envs", "num_workers", "rollout")
+    rows_per_worker(**{name: settings["collector"][name] for name in counts})  # refused before any work
     chosen = {key: value for key, value in settings["agent"].items() if value is not None}
     agent = make_agent(scenes=scenes, **chosen).to(device)
     algorithm = make_algorithm(settings["algorithm"]["name"], agent, scenes, settings)
