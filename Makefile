@@ -6,7 +6,7 @@ STAMP := $(VENV)/.installed-dev
 RENDER := $(VENV)/.installed-render
 DOCS := $(VENV)/.installed-docs
 
-.PHONY: demo docs test lint typecheck clean help
+.PHONY: demo docs faults test lint typecheck clean help
 
 help:  ## list the targets
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/'
@@ -44,6 +44,9 @@ typecheck: $(STAMP)  ## mypy
 
 test: lint typecheck $(RENDER)  ## lint, type-check, all tests and doctests
 	$(BIN)/python -m pytest -n 2 -q
+
+faults: $(STAMP)  ## the long form of the suites of faults, half an hour; writes docs/reliability.md
+	$(BIN)/python tests/faults/long.py $(FAULTS)
 
 clean:  ## remove the virtual environment and everything built
 	rm -rf $(VENV) build dist docs/_build docs/api *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis

@@ -17,6 +17,7 @@ from typing import Any
 
 import h5py
 import numpy as np
+import torch
 import yaml
 
 __all__ = ["KINDS", "mutations"]
@@ -101,6 +102,29 @@ def _value(value: Any, rng: random.Random) -> Any:
 
 def _json(data: bytes, rng: random.Random) -> bytes:
     return json.dumps(_value(json.loads(data), rng)).encode()
+
+
+def _checkpoint(data: bytes, rng: random.Random) -> bytes:
+    """One value of a checkpoint replaced, or one of its tensors by another."""
+    state = torch.load(io.BytesIO(data), weights_only=True)
+    place, key = state, rng.choice(list(state))
+    while isinstance(place[key], dict) and place[key] and rng.random() < 0.8:
+        place = place[key]
+        key = rng.choice(list(place))
+    value = place[key]
+    if isinstance(value, torch.Tensor) and rng.random() < 0.7:
+        nan = torch.full_like(value.float(), float("nan"))
+        lost, huge = value.flatten()[:-1].clone(), torch.full_like(value, 127)
+        place[key] = rng.choice(
+            [nan, lost, huge, value.unsqueeze(0).clone(), value.double(), value.expand(2, *value.shape)]
+        )
+    elif rng.random() < 0.2:
+        del place[key]
+    else:
+        place[key] = rng.choice([_value(value, rng), torch.zeros(3), torch.zeros(2, 0), b"x"])
+    file = io.BytesIO()
+    torch.save(state, file)
+    return file.getvalue()
 
 
 def _yaml(data: bytes, rng: random.Random) -> bytes:
@@ -251,6 +275,7 @@ KINDS: dict[str, list[Callable[[bytes, random.Random], bytes]]] = {
     "npz": [_zip],
     "npy": [_npy],
     "hdf5": [_hdf5],
+    "checkpoint": [_checkpoint, _checkpoint, _zip],
 }
 
 

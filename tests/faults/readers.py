@@ -4,17 +4,22 @@ from __future__ import annotations
 
 import io
 import json
+import logging
 import shutil
 import zipfile
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
 import torch
+from omegaconf import OmegaConf
 from PIL import Image
 
+from vusfa.cli.launch import compose
 from vusfa.envs import resolve_goals
 from vusfa.envs.goals import read_manifest as read_goals
 from vusfa.errors import SceneError
@@ -34,6 +39,7 @@ from vusfa.sources.photo_tables import read_edges, read_poses
 from vusfa.sources.photos import fit_picture, read_features
 from vusfa.sources.render.plan_file import load_plan
 from vusfa.sources.row_log import RowLog
+from vusfa.training import Trainer, load_agent, make_trainer
 
 __all__ = ["READERS", "Reader"]
 
@@ -208,7 +214,44 @@ def _decode(path: Path) -> None:
 
 _ROOMS = SceneSet([_scene()])
 
+
+def _trainer() -> Trainer:
+    logging.getLogger("torchrl").setLevel(logging.WARNING)  # it writes to standard output
+    overrides = ["agent.hidden_size=4", "agent.embedding_size=4", "agent.history=1", "env.goals=[0,2]"]
+    overrides += ["collector.num_envs=2", "collector.rollout=4", "algorithm=hindsight"]
+    overrides += ["hindsight.batch_size=8", "hindsight.capacity=40", "hindsight.updates=2"]
+    return make_trainer(_settings(*overrides), scenes=_ROOMS)
+
+
+@cache
+def _settings(*overrides: str) -> Any:
+    return OmegaConf.to_container(compose(overrides=overrides), resolve=True)
+
+
+@cache
+def _learned() -> bytes:
+    trainer = _trainer()
+    with TemporaryDirectory() as folder, trainer.collecting() as batches:
+        trainer.update(batches)
+        return trainer.save(Path(folder, "checkpoint.pt")).read_bytes()
+
+
+def _checkpoint(folder: Path) -> Path:
+    (folder / "checkpoint.pt").write_bytes(_learned())
+    return folder / "checkpoint.pt"
+
+
+def _resume(path: Path) -> None:
+    """For an evaluation, and to go on."""
+    load_agent(path, _ROOMS)
+    trainer = _trainer()
+    trainer.resume(path)
+    with trainer.collecting() as batches:
+        trainer.update(batches)
+
+
 READERS: dict[str, Reader] = {
+    "checkpoint": Reader("checkpoint", _checkpoint, _resume),
     "scene": Reader("hdf5", _jpeg_scene, _read_scene),
     "scene, raw": Reader("hdf5", _raw_scene, _read_scene),
     "compact": Reader("hdf5", _jpeg_scene, _compact),

@@ -233,7 +233,7 @@ class HindsightReplay:
             raise ValueError(f"seen states {tuple(scene_of.shape)} where there are {num_states}")
         if length:
             rows = state["rows"]
-            _check_rows(rows, length, num_states)
+            _check_rows(rows, length, scene_of)
             self.buffer.extend(TensorDict(rows, [length]))
             writer = state["writer"]
             if isinstance(writer, int):  # of version 0.1: the position alone
@@ -243,8 +243,9 @@ class HindsightReplay:
         self.sampler.load_state_dict(state["sampler"])
 
 
-def _check_rows(rows: dict[str, Any], length: int, num_states: int) -> None:
+def _check_rows(rows: dict[str, Any], length: int, scene_of: Tensor) -> None:
     """Refuse rows that would be read out of bounds."""
+    num_states = len(scene_of)
     shapes = {"scene_id": (length,), "action": (length,), "clock": (length,)}
     states = rows["state_id"], rows["next"]["state_id"]
     wrong = [name for name, shape in shapes.items() if rows[name].shape != shape or rows[name].min() < 0]
@@ -252,3 +253,5 @@ def _check_rows(rows: dict[str, Any], length: int, num_states: int) -> None:
         raise ValueError(f"rows of other shapes: {', '.join(wrong) or 'state_id'}")
     if any(bool((ids < 0).any() or (ids >= num_states).any()) for ids in states):
         raise ValueError(f"rows of states that are not among {num_states}")
+    if bool((rows["scene_id"] > scene_of.max()).any()):
+        raise ValueError("rows of scenes in which no state was seen")

@@ -104,10 +104,11 @@ def load_checkpoint(path: str | Path, device: torch.device | str = "cpu") -> dic
     if not os.path.isfile(path):  # Path.is_file raises in a folder that may not be looked into
         raise CheckpointError(f"{path}: no such checkpoint; vusfa train writes RUN/checkpoint.pt")
     state = read_content(path, device)
-    if not isinstance(state, dict) or "agent_config" not in state:
-        raise CheckpointError(
-            f"{path}: no checkpoint of vusfa ('agent_config' is missing); give one of vusfa train"
-        )
+    for name, kind in {"agent_config": dict, "format": int}.items():
+        if not isinstance(state, dict) or type(state.get(name)) is not kind:
+            raise CheckpointError(
+                f"{path}: no checkpoint of vusfa ({name!r} is missing); give one of vusfa train"
+            )
     if state.get("format") == 1:
         try:
             state = upgrade(state)
