@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import importlib
+import re
 import sys
 
 import pytest
 
-from vusfa.deprecated import MOVED_MODULES, moved_names
+from vusfa.deprecated import MOVED_MODULES, REMOVED_MODULES, REMOVED_NAMES, moved_names
 
 
 @pytest.mark.parametrize("old", MOVED_MODULES)
@@ -41,3 +42,28 @@ def test_moved_names_finds_warns_and_refuses() -> None:
         assert find("root")(9.0) == 3.0
     with pytest.raises(AttributeError, match="has no attribute 'other'"):
         find("other")
+
+
+@pytest.mark.parametrize("name", REMOVED_NAMES)
+def test_a_name_that_is_gone_says_what_to_use(name: str) -> None:
+    home = "vusfa.objectives" if name == "n_step_return" else "vusfa.modules"
+    with pytest.raises(ImportError, match=rf"{home}\.{name} is not in version 0\.2 any more: .*\w"):
+        exec(f"from {home} import {name}")
+
+
+@pytest.mark.parametrize("name", REMOVED_MODULES)
+def test_a_module_that_is_gone_says_what_to_use(name: str) -> None:
+    with pytest.raises(ModuleNotFoundError, match=rf"{name} is not in version 0\.2 any more: vusfa"):
+        importlib.import_module(name)
+
+
+@pytest.mark.parametrize("instead", [*REMOVED_NAMES.values(), *REMOVED_MODULES.values()])
+def test_what_to_use_instead_is_there(instead: str) -> None:
+    place = re.search(r"vusfa(?:\.\w+)+", instead)
+    if place is None:
+        assert instead.startswith("agent.get_policy_operator()")
+        return
+    _, room, *names = place[0].split(".")
+    found = importlib.import_module(f"vusfa.{room}")
+    for each in names:
+        found = getattr(found, each)

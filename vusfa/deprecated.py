@@ -1,7 +1,7 @@
 """Old names of modules and objects: they work for one release and warn with the new name.
 
-One table for modules, one for objects of modules that still exist. Both are data: to move something, move it
-and add a line here.
+One table for modules, one for objects of modules that still exist; what is gone for good says what to use
+instead. They are data: to move something, move it and add a line here.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from importlib.machinery import ModuleSpec
 from types import ModuleType
 from typing import Any
 
-__all__ = ["MOVED_MODULES", "install", "moved_names"]
+__all__ = ["MOVED_MODULES", "REMOVED_MODULES", "REMOVED_NAMES", "install", "moved_names"]
 
 #: Modules of version 0.1 and what they are called now.
 MOVED_MODULES: dict[str, str] = {
@@ -54,6 +54,22 @@ MOVED_MODULES: dict[str, str] = {
         )
     },
 }  # fmt: skip
+#: What version 0.1 had and nothing equals now, and what to use instead.
+REMOVED_MODULES: dict[str, str] = {
+    "vusfa.modules.freezing": "vusfa.modules.InferencePolicy.cached keeps answers while weights stand still",
+    "vusfa.modules.normalised": "vusfa.modules.FeatureFrames normalizes features",
+    "vusfa.objectives.distinct": "vusfa.modules.unique computes equal rows once",
+}
+REMOVED_NAMES: dict[str, str] = {
+    "ActionTable": "vusfa.modules.TabularPolicy tabulates a policy's actions",
+    "GaussianEncoder": "vusfa.modules.SiameseEncoder takes a vusfa.modules.GaussianBottleneck",
+    "NormalisedEncoder": REMOVED_MODULES["vusfa.modules.normalised"],
+    "StateGoalPairs": "vusfa.modules.TabularPolicy computes pairs of state and goal once",
+    "action_logits": "agent.get_policy_operator().get_dist(tensordict).logits gives them",
+    "frozen": REMOVED_MODULES["vusfa.modules.freezing"],
+    "n_step_return": "vusfa.objectives.lambda_return bootstraps at a rollout's end, or earlier with lmbda",
+    "sees_one_frame": "vusfa.modules.Agent.is_tabular says it",
+}
 
 
 class _Moved(MetaPathFinder, Loader):
@@ -65,6 +81,8 @@ class _Moved(MetaPathFinder, Loader):
     def find_spec(
         self, fullname: str, path: Sequence[str] | None, target: ModuleType | None = None
     ) -> ModuleSpec | None:
+        if fullname in REMOVED_MODULES:
+            raise ModuleNotFoundError(_gone(fullname, REMOVED_MODULES[fullname]), name=fullname)
         return ModuleSpec(fullname, self) if _new_name(fullname) else None
 
     def create_module(self, spec: ModuleSpec) -> ModuleType:
@@ -92,6 +110,10 @@ def _new_name(old: str) -> str | None:
     return None
 
 
+def _gone(name: str, instead: str) -> str:
+    return f"{name} is not in version 0.2 any more: {instead}"
+
+
 def install() -> None:
     """Let old names of modules be imported; :mod:`vusfa` does this once."""
     if not any(isinstance(finder, _Moved) for finder in sys.meta_path):
@@ -113,6 +135,8 @@ def moved_names(module: str, names: Mapping[str, str]) -> Callable[[str], Any]:
     """
 
     def find(name: str) -> Any:
+        if name in REMOVED_NAMES and name not in names:
+            raise ImportError(_gone(f"{module}.{name}", REMOVED_NAMES[name]))  # a from-import tells no other
         if name not in names:
             raise AttributeError(f"module {module!r} has no attribute {name!r}")
         place, _, attribute = names[name].rpartition(".")

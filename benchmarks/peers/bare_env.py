@@ -13,6 +13,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from vusfa.conf.settings import MAX_STEPS
 from vusfa.scenes import SceneSet
 
 __all__ = ["After", "BareEnv", "random_frames"]
@@ -62,7 +63,7 @@ class BareEnv:
         num_envs: int,
         *,
         history: int = 4,
-        max_steps: int = 500,
+        max_steps: int = MAX_STEPS,
         sampling: str = "episode",
         goal_reward: float = 1.0,
         step_reward: float = -0.01,

@@ -18,6 +18,7 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.vec_env.base_vec_env import VecEnv
 from torch import Tensor, nn
 
+from vusfa.conf.settings import MAX_STEPS
 from vusfa.envs import resolve_goals
 from vusfa.scenes import SceneSet
 
@@ -156,7 +157,7 @@ def make_sb3(
     import stable_baselines3
 
     env = SceneVecEnv(
-        scenes, num_envs, seed, goals=resolve_goals(scenes, goals), history=history, max_steps=500
+        scenes, num_envs, seed, goals=resolve_goals(scenes, goals), history=history, max_steps=MAX_STEPS
     )
     shape = {
         "features_extractor_class": SiameseExtractor,

@@ -113,3 +113,11 @@ def test_three_numbers() -> None:
     assert network_options(mean=None, std="1, 2,3") == {"mean": None, "std": (1.0, 2.0, 3.0)}
     with pytest.raises(ConfigError):
         network_options(std="1,2,3,4")
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
+@pytest.mark.parametrize("device", ["cuda", "cuda:7", "gpu"])
+def test_a_device_that_is_not_there(run, tmp_path: Path, device: str) -> None:
+    done = run("encode", tmp_path / "a.h5", tmp_path / "b.h5", "--device", device)
+    assert (done.exit_code, done.stderr.count("\n")) == (1, 1)
+    assert done.stderr.startswith(f"error: device is {device!r}, which cannot be used here")

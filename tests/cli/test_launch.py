@@ -70,6 +70,12 @@ def test_the_job_gets_settings_and_the_command_line(run):
         ("seed", "cannot read 'seed'"),
         ("seed=[1", "cannot read 'seed=[1'"),
         ("seed=abc", "seed is 'abc'; it must be a whole number, such as 0"),
+        ("seed=-1", "seed is -1; it must be 0 to 4294967295"),
+        ("seed=4294967296", "seed is 4294967296; it must be 0 to 4294967295"),
+        ("total_frames=1e3", "total_frames is 1000.0; it must be a whole number, such as 1000"),
+        ("preset=paper total_frames=1e3", "total_frames is 1000.0; it must be a whole number, such as 1000"),
+        ("collector.timeout=0", "collector.timeout is 0.0; it must be more than 0"),
+        ("overwrite=yes", "overwrite is 'yes'; it must be true or false"),
         ("seed=1.5", "seed is 1.5; it must be a whole number, such as 0"),
         ("seed=null", "seed is null; it must be a whole number, such as 0"),
         ("optim.lr=fast", "optim.lr is 'fast'; it must be a number, such as 0.001"),
@@ -85,7 +91,7 @@ def test_the_job_gets_settings_and_the_command_line(run):
     ],
 )
 def test_a_mistake_is_one_line(run, argument: str, message: str):
-    code, text = run(argument)
+    code, text = run(*argument.split())
     assert code == 2
     assert text.startswith(f"error: {message}")
     assert text.count("\n") == 1

@@ -84,7 +84,9 @@ def encode(
     from vusfa.cli.resumed import resumed
     from vusfa.sources.backbones import load_backbone
     from vusfa.sources.encode import encode_scene
+    from vusfa.training import torch_device
 
+    torch_device(device)  # before the pictures are read
     options = network_options(crops=crops, size=size, resize=resize, mean=mean, std=std)
     network = load_backbone(backbone, weights=weights, layer=layer, device=device, **options)
     with resumed("encoding", "pictures") as report:

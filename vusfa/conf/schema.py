@@ -6,6 +6,7 @@ Needs Hydra (extra ``recipes``).
 from __future__ import annotations
 
 import difflib
+import reprlib
 import types
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import fields, is_dataclass
@@ -166,6 +167,8 @@ def _check_ranges(settings: Mapping[str, Any]) -> None:
         raise ConfigError(
             f"early_stopping.success is {share}; it is a share of episodes, at most 1: give 0.9"
         )
+    if not 0 <= settings["seed"] < 2**32:
+        raise ConfigError(f"seed is {reprlib.repr(settings['seed'])}; it must be 0 to {2**32 - 1}")
 
 
 def _type_of(name: str) -> tuple[Any, bool]:
@@ -189,6 +192,8 @@ def _wrong_value(name: str, value: Any) -> str:
         return f"{name} is {_shown(value)}; it is a group of settings: give {'=..., '.join(inner)}=..."
     words = "a list" if get_origin(kind) is list else _WORDS.get(kind, "another value")
     example = "" if kind is bool else _example(name)
+    if kind is int and isinstance(value, float) and value.is_integer():
+        example = f"{value:.0f}"
     words += f", such as {example}" if example not in ("", "null") else ""
     return f"{name} is {_shown(value)}; it must be {words}{' or null' if optional else ''}"
 

@@ -1,7 +1,7 @@
 """Settings of a training: one dataclass per group, with the type of every setting.
 
-Their values stand in the YAML files beside this module, once. :mod:`vusfa.conf.schema` checks values against
-these types with OmegaConf. ``None`` stands for ``null``.
+Their values stand once: in the YAML files beside this module, or here where every choice has the same.
+:mod:`vusfa.conf.schema` checks values against these types with OmegaConf. ``None`` stands for ``null``.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ from typing import Any
 __all__ = [
     "ALGORITHMS",
     "LOSS_TERMS",
+    "MAX_STEPS",
     "POSITIVE",
     "AgentSettings",
     "CollectorSettings",
@@ -32,7 +33,9 @@ __all__ = [
 ALGORITHMS: dict[str, Any] = {}
 #: Registered additional loss terms (:func:`vusfa.algorithms.register_loss_term`), with a coefficient of 0.
 LOSS_TERMS: dict[str, float] = {}
-#: Settings that a run divides by.
+#: Steps after which an episode is truncated, in training and evaluation, unless settings say otherwise.
+MAX_STEPS = 500
+#: Settings that a run divides by, and a time limit.
 POSITIVE = (
     "log_every",
     "checkpoint_every",
@@ -49,12 +52,12 @@ class EnvSettings:
     """Of :class:`vusfa.envs.TargetNavEnv`; goals and crop may be of several types."""
 
     goals: Any
-    max_steps: int
     goal_sampling: str
     crop: Any
     goal_reward: float
     step_reward: float
     collision_reward: float | None
+    max_steps: int = MAX_STEPS
 
 
 @dataclass
@@ -160,7 +163,7 @@ class EvaluationSettings:
 
     goals: Any
     episodes_per_goal: int
-    max_steps: int
+    max_steps: int = MAX_STEPS
 
 
 @dataclass

@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from vusfa.conf.settings import MAX_STEPS
 from vusfa.errors import ActionError
 
 __all__ = [
@@ -33,8 +34,6 @@ __all__ = [
 # The task's defaults.
 #: frames that an agent sees, the present one included
 HISTORY = 4
-#: steps after which an episode is truncated
-MAX_STEPS = 500
 #: reward of reaching the goal, and of any other step
 GOAL_REWARD, STEP_REWARD = 1.0, -0.01
 

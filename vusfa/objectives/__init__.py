@@ -1,5 +1,6 @@
 """What is learned: losses, returns, and the optimiser and multiplier of the paper's code."""
 
+from vusfa.deprecated import moved_names
 from vusfa.objectives.a3c import A3CRMSprop
 from vusfa.objectives.functional import (
     dual_ascent,
@@ -38,3 +39,5 @@ __all__ = [
     "successor_return",
     "walked_return",
 ]
+
+__getattr__ = moved_names(__name__, {})

@@ -17,6 +17,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import FunctionCtx
 
+from vusfa.deprecated import moved_names
 from vusfa.modules.bottleneck import gaussian_kl
 
 __all__ = [
@@ -267,3 +268,6 @@ def assert_same_shape(function: str, **tensors: Tensor) -> None:
     shapes = {name: tuple(tensor.shape) for name, tensor in tensors.items()}
     if len(set(shapes.values())) > 1:
         raise ValueError(f"{function}: shapes differ: {shapes}; give equal ones")
+
+
+__getattr__ = moved_names(__name__, {})

@@ -65,7 +65,7 @@ FORMAT = 2
 # entries of Agent.config that describe the scenes, not the agent
 _OF_SCENES = ("scenes", "fingerprint", "num_actions")
 # settings whose other wording changes nothing: scenes are told apart by their content
-_REWORDED = ("resume", "scenes")
+_REWORDED = ("resume", "scenes", "folder", "overwrite", "name")
 
 
 def save_checkpoint(path: str | Path, state: Mapping[str, Any]) -> Path:
