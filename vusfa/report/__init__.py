@@ -1,4 +1,4 @@
-"""One self-contained page of what runs learned: tables, curves, floor maps, an explorer.
+"""Reports of results: tables, figures, and one self-contained page with curves, floor maps and an explorer.
 
 >>> from vusfa.report import Options, read_source, write_report
 """

@@ -1,4 +1,4 @@
-"""Runs in, a page and its tables out."""
+"""Write a report: the page and its tables."""
 
 from __future__ import annotations
 
@@ -16,30 +16,30 @@ __all__ = ["write_report"]
 def write_report(
     runs: Sequence[LoggedRun], out: str | Path, options: Options | None = None
 ) -> tuple[list[Path], dict[str, list[Row]]]:
-    """Writes the page, and its tables as CSV into a folder beside it, ``PAGE_tables``.
+    """Write the page, and its tables as CSV to a folder beside it, ``PAGE_tables``.
 
     Args:
         runs: what to report.
-        out: the page; its folder is made when it is missing.
+        out: the page; its folder is created if necessary.
         options: see :class:`~vusfa.report.content.Options`.
 
     Returns:
         the paths, the page first, and the tables.
 
     Raises:
-        ConfigError: no runs, runs that do not fit one another, or more than the page may weigh.
-        VusfaError: a scene or a checkpoint that cannot be read.
+        ConfigError: no runs, runs that do not belong together, or a page over its size limit.
+        VusfaError: a scene or a checkpoint cannot be read.
     """
     options, out = options or Options(), Path(out)
     content, tables = gather(runs, options)
     weight, most = page_weight(content), options.megabytes * 1e6
     if weight > most:
         raise ConfigError(
-            f"the page weighs {weight / 1e6:.1f} MB before a single picture, more than megabytes="
+            f"the page has {weight / 1e6:.1f} MB without pictures, more than megabytes="
             f"{options.megabytes:g}; give fewer goals_per_scene, seeds or walks, or more megabytes"
         )
     options.tell("pictures")
-    # every state's id and where its picture ends take up to 16 bytes
+    # the id of a state and the end of its picture take up to 16 bytes
     states = sum(scene["states"] for scene in content["scenes"].values())
     room = max(0, int(most - weight) - 16 * states - 1000)
     shown = content["agents"] or content["maps"]  # nothing else shows pictures

@@ -20,16 +20,16 @@ Row = dict[str, Any]
 
 
 def goal_rows(runs: Sequence[LoggedRun], within: Sequence[int] = WITHIN) -> list[Row]:
-    """One row per model and goal: what the floor maps show.
+    """One row per model and goal, for the floor maps.
 
     Args:
         runs: those without an evaluation are left out.
-        within: numbers of actions to give the success within.
+        within: limits of actions to report success for.
 
     Returns:
-        rows with model, scene, goal (state id), trained (of any seed), seeds, num_episodes (of all seeds
-        together) and the metrics over all episodes of all seeds; and where every seed has them, the exact
-        values ``exact_100``, ``exact_500`` and ``exact_spl``, means over the seeds.
+        rows with model, scene, goal (state id), trained (in any seed), seeds, num_episodes and the metrics
+        over the episodes of all seeds; and where every seed has them, the exact values ``exact_100``,
+        ``exact_500`` and ``exact_spl``, means over the seeds.
     """
     table = long_table(runs, within)
     if table is None:
@@ -61,17 +61,16 @@ def goal_rows(runs: Sequence[LoggedRun], within: Sequence[int] = WITHIN) -> list
 
 
 def distance_rows(runs: Sequence[LoggedRun], scenes: SceneSet, within: Sequence[int] = WITHIN) -> list[Row]:
-    """Success by the distance of a goal from the nearest goal that the model was trained on.
+    """One row per model and distance of the goal from the nearest trained goal.
 
     Args:
         runs: those without an evaluation, or without trained goals in it, are left out.
-        scenes: the scenes that the episodes name.
-        within: numbers of actions to give the success within.
+        scenes: of the episodes.
+        within: limits of actions to report success for.
 
     Returns:
-        rows with model, distance (words, such as "3–4"), from and to (actions from the nearest trained goal
-        to this one, inclusive), seeds, num_goals (of the first seed), and the metrics over the seeds, with
-        ``_low`` and ``_high``.
+        rows with model, distance (text, such as "3–4"), from and to (actions, inclusive), seeds, num_goals
+        (of the first seed), and the metrics over the seeds with ``_low`` and ``_high``.
     """
     groups: dict[tuple[str, int], list[Row]] = {}
     names: list[str] = []
@@ -84,8 +83,8 @@ def distance_rows(runs: Sequence[LoggedRun], scenes: SceneSet, within: Sequence[
         index = {name: scenes.scene_index(name) for name in run.episodes.scene_names}
         scene = torch.tensor([index[name] for name in table.scene])
         goal, trained = (torch.tensor(table[name].to_numpy()) for name in ("goal", "trained"))
-        away = distance_to_trained(scenes, scene, goal, trained)
-        table = table.assign(bin=torch.bucketize(away, torch.tensor(DISTANCE_BINS), right=True).numpy() - 1)
+        far = distance_to_trained(scenes, scene, goal, trained)
+        table = table.assign(bin=torch.bucketize(far, torch.tensor(DISTANCE_BINS), right=True).numpy() - 1)
         table = table[table.bin >= 0]
         numbers = table.groupby("bin")[["scene", "goal"]].apply(lambda part: len(part.drop_duplicates()))
         pooled = pool(table, ["bin", "metric"]).pivot(index="bin", columns="metric", values="value")

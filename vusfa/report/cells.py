@@ -1,4 +1,4 @@
-"""Readers of whatever a report is given: folders of runs and of results (:mod:`vusfa.experiments.runs`)."""
+"""Readers of a report's sources: folders of runs, and of results (:mod:`vusfa.experiments.runs`)."""
 
 from __future__ import annotations
 
@@ -18,17 +18,17 @@ __all__ = ["read_source", "result_run"]
 
 
 def read_source(source: str | Path, mode: str = "sampled", runs: str | Path = "runs") -> list[LoggedRun]:
-    """Reads whatever a report may be given.
+    """Read the runs of one source of a report.
 
     Args:
         source: folder of a run of vusfa train, of one run of results, or of a sweep or an experiment, all of
             whose runs are read; ``NAME=FOLDER`` calls the model NAME. A sweep's ``multirun.yaml`` is no run.
-        mode: of evaluation, ``sampled`` or ``greedy``.
-        runs: where the trainings keep logs and checkpoints, ``RUNS/EXPERIMENT/RUN``.
+        mode: of the evaluation, ``sampled`` or ``greedy``.
+        runs: folder of logs and checkpoints, ``RUNS/EXPERIMENT/RUN``.
 
     Raises:
-        ConfigError: none of these, or files in it that cannot be read.
-        ResultError: results that are damaged.
+        ConfigError: it is none of these, or a file cannot be read.
+        ResultError: the results are damaged.
 
     >>> read_source("/no/such/folder")
     Traceback (most recent call last):
@@ -57,17 +57,16 @@ def read_source(source: str | Path, mode: str = "sampled", runs: str | Path = "r
 
 
 def result_run(folder: Path, label: str = "", mode: str = "sampled", runs: str | Path = "runs") -> LoggedRun:
-    """Results as a run; with its log and its checkpoint, where its training has kept them.
+    """Results as a run, with the log and the checkpoint of its training where they exist.
 
     Args:
         folder: ``.../EXPERIMENT/RUN``.
-        label: what to call its model; its row's name when empty.
-        mode: which of its evaluations counts.
-        runs: see :func:`read_source`.
+        label: of its model; its row's name by default.
+        mode, runs: see :func:`read_source`.
 
     Raises:
-        ConfigError: it was not evaluated in this mode.
-        ResultError: it is damaged.
+        ConfigError: there is no evaluation of this mode.
+        ResultError: the results are damaged.
     """
     folder = folder.absolute()
     run = results.read_run(folder.parent.parent, folder.parent.name, folder.name)
@@ -81,7 +80,7 @@ def result_run(folder: Path, label: str = "", mode: str = "sampled", runs: str |
     scenes = info.get("scenes", episodes.scene_names if episodes else ())
     settings: dict[str, Any] = {"agent": {"model": info.get("model", run.name)}, "scenes": list(scenes)}
     settings["overrides"] = [text for text in info.get("overrides", ()) if not str(text).startswith("seed=")]
-    if (kept / "config.json").is_file():  # it names scenes' files, too
+    if (kept / "config.json").is_file():  # it has the scenes' files, too
         settings = dict(read_run(kept).settings)
     return LoggedRun(
         label or run.label,

@@ -40,23 +40,23 @@ def report_runs(
     project: str = "vusfa",
     threads: int = 1,
 ) -> None:
-    """Write one HTML page of runs and results, which needs nothing from outside.
+    """Write one self-contained HTML page of runs and results.
 
-    Its tables lie beside it as CSV, unrounded, in the folder PAGE_tables. NAME=FOLDER calls a model
-    NAME; runs of one name are seeds of one thing.
+    Its tables are written beside it as CSV, unrounded, in the folder PAGE_tables. NAME=FOLDER calls a model
+    NAME; runs of one name are seeds of one model, unless their settings differ.
 
     Args:
         sources: folders of runs of vusfa train, of results, of sweeps or of experiments.
         out: the page.
         title: of the page.
-        goals_per_scene: goals of each scene in the explorer, at most.
-        seeds: runs of each model in the explorer, the first ones given.
-        walks: sampled walks to each of these goals.
-        max_steps: actions allowed in these walks.
-        mode: of the evaluations that results hold.
-        runs: where the trainings of results keep logs and checkpoints, as RUNS/EXPERIMENT/CELL.
-        scenes: bundled names and files, where they have moved since the training.
-        megabytes: what the page may weigh; goals, then pictures are left out to keep it.
+        goals_per_scene: most goals per scene in the explorer.
+        seeds: runs per model in the explorer, the first ones given.
+        walks: sampled episodes to each of these goals.
+        max_steps: limit of actions of these episodes.
+        mode: of the evaluations in results.
+        runs: folder of the logs and checkpoints of results, RUNS/EXPERIMENT/RUN.
+        scenes: bundled names and files, if they have moved since the training.
+        megabytes: size limit of the page; goals, then pictures are left out to keep it.
         wandb: send the tables to W&B, too; offline leaves them beside the page.
         project: of W&B.
         threads: processor threads; more than 1 pays on an idle machine only.

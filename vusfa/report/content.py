@@ -1,4 +1,4 @@
-"""From runs to everything that a report's page shows, as plain data."""
+"""The content of a report's page as plain data, made from runs."""
 
 from __future__ import annotations
 
@@ -39,19 +39,19 @@ _SHARE_OF_MAPS = 0.4
 
 @dataclass(frozen=True)
 class Options:
-    """What goes into a page.
+    """Options of a page.
 
     Args:
         title: of the page.
-        within: numbers of actions to give the success for.
-        goals_per_scene: goals of each scene in the explorer, at most.
-        seeds: runs of each model in the explorer, the first ones.
-        walks: sampled walks to each of these goals.
-        max_steps: actions allowed in these walks.
-        megabytes: what the page may weigh.
-        command: that made it, for whoever makes it again.
-        scenes: where the runs' scenes are now, see :func:`open_scenes`.
-        tell: called with a line on what is being done.
+        within: limits of actions to report success for.
+        goals_per_scene: most goals per scene in the explorer.
+        seeds: runs per model in the explorer, the first ones.
+        walks: sampled episodes to each of these goals.
+        max_steps: limit of actions of these episodes.
+        megabytes: size limit of the page.
+        command: that makes the page again.
+        scenes: the runs' scenes, if they have moved, see :func:`open_scenes`.
+        tell: called with a line of progress.
     """
 
     title: str = "What the runs learned"
@@ -67,16 +67,16 @@ class Options:
 
 
 def open_scenes(runs: Sequence[LoggedRun], given: SceneSet | None = None) -> dict[str, Scene]:
-    """The scenes of all runs, by name, each the very one that its run was trained in.
+    """The scenes of all runs by name, checked against their trainings.
 
     Args:
-        runs: what to report.
-        given: where the runs' scenes are now; found as the checkpoints and settings say by default.
+        runs: of the report.
+        given: the runs' scenes; opened from their checkpoints and settings by default.
 
     Raises:
         ConfigError: two runs have different scenes of one name, or a run has episodes of another scene.
-        CheckpointError: a scene is another one than that of the training.
-        SceneError: a scene is not where it was.
+        CheckpointError: a scene differs from that of the training.
+        SceneError: a scene cannot be found.
     """
     found: dict[str, tuple[Scene, LoggedRun]] = {}
     opened = lru_cache(SceneSet.open)
@@ -144,9 +144,9 @@ def tables(runs: Sequence[LoggedRun], scenes: Mapping[str, Scene], options: Opti
     """The report's tables by name: summary, seeds, distance, goals, runs.
 
     Args:
-        runs: what to report.
+        runs: of the report.
         scenes: of :func:`open_scenes`.
-        options: ``within`` is read.
+        options: for ``within``.
     """
     world = SceneSet(scenes.values())
     beside: list[Row] = []
@@ -162,7 +162,7 @@ def tables(runs: Sequence[LoggedRun], scenes: Mapping[str, Scene], options: Opti
 
 
 def goal_limit(states: Sequence[int], agents: int, options: Options) -> int:
-    """Goals of each scene that the explorer can show within the page's weight.
+    """Goals per scene in the explorer within the size limit of the page.
 
     >>> goal_limit([176, 404, 680, 452], 4, Options())
     24
@@ -176,18 +176,18 @@ def goal_limit(states: Sequence[int], agents: int, options: Options) -> int:
 def gather(
     runs: Sequence[LoggedRun], options: Options | None = None
 ) -> tuple[dict[str, Any], dict[str, list[Row]]]:
-    """Everything on the page but the pictures (see :func:`add_pictures`).
+    """The page's content without pictures (see :func:`add_pictures`).
 
     Args:
-        runs: what to report, at least one.
+        runs: of the report, at least one.
         options: see :class:`Options`.
 
     Returns:
-        the page's content, plain data, and the tables in it.
+        the content, plain data, and its tables.
 
     Raises:
-        ConfigError: no runs, or runs that do not fit one another.
-        VusfaError: a scene or a checkpoint that cannot be read.
+        ConfigError: no runs, or runs that do not belong together.
+        VusfaError: a scene or a checkpoint cannot be read.
     """
     options = options or Options()
     if not runs:
@@ -237,7 +237,7 @@ def gather(
 
 
 def _metrics(rows: Mapping[str, Sequence[Row]]) -> list[Row]:
-    """How the page shows each metric, in order; ``exact`` marks those of the floor maps alone."""
+    """How the page shows each metric, in order; ``exact`` marks those of the floor maps."""
     found = [(name, get_metric(name), False) for name in metric_columns(rows["summary"])]
     logged = dict.fromkeys(name for row in rows["goals"] for name in row if name.startswith("exact_"))
     for name in sorted(logged, key=lambda name: (not name[6:].isdigit(), name)):
@@ -252,12 +252,12 @@ def _metrics(rows: Mapping[str, Sequence[Row]]) -> list[Row]:
 
 
 def add_pictures(content: dict[str, Any], scenes: Mapping[str, Scene], budget: int) -> None:
-    """Put small pictures of the scenes into ``content``, those of goals and walks first.
+    """Add small pictures of the scenes to ``content``, those of goals and episodes first.
 
     Args:
         content: of :func:`gather`; changed in place.
         scenes: of :func:`open_scenes`.
-        budget: bytes of base 64 that they may take together, dealt out by the scenes' states.
+        budget: bytes of base 64 of all pictures, divided by the scenes' numbers of states.
     """
     total = sum(scene.num_states for scene in scenes.values() if scene.has_pictures)
     for name, scene in scenes.items():
@@ -279,7 +279,7 @@ def _explored_goals(scene: Scene, rows: Sequence[Row], limit: int) -> list[int]:
 
 
 def _success_maps(rows: Sequence[Row], scenes: Mapping[str, Scene], within: Sequence[int]) -> list[Row]:
-    """For each model and scene the measures of every state as a goal, packed; the random walk last."""
+    """Metrics of every state as a goal, packed, per model and scene; the random walk last."""
     found: dict[tuple[str, str], list[Row]] = {}
     for row in rows:
         found.setdefault((row["model"], row["scene"]), []).append(row)
@@ -309,7 +309,7 @@ def _success_maps(rows: Sequence[Row], scenes: Mapping[str, Scene], within: Sequ
 
 
 def _hardest(row: Row) -> str:
-    """The success within the fewest actions."""
+    """Name of success within the lowest limit."""
     return [name for name in metric_columns([row]) if name.startswith("success_")][-1]
 
 
@@ -354,10 +354,10 @@ def _explored(run: LoggedRun, goals: Mapping[str, Sequence[int]], options: Optio
 
 
 def _symmetric(components: torch.Tensor) -> list[Row]:
-    """One packed (G, N) for each component, its ends the same on either side of 0, the few farthest cut."""
+    """One packed (G, N) per component, on a scale symmetric about 0 that cuts the few farthest values."""
     packed = []
     for part in components.unbind(-1):
-        sample = part.abs().flatten()[:: max(1, part.numel() // 100_000)]  # quantile takes no more
+        sample = part.abs().flatten()[:: max(1, part.numel() // 100_000)]  # the most that quantile takes
         end = float(torch.quantile(sample, 0.995)) or 1.0
         packed.append(pack(part, "u8", -end, end))
     return packed

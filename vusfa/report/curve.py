@@ -1,4 +1,4 @@
-"""The learning curve of a run as a picture."""
+"""The learning curve of a run as PNG."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def read_metrics(path: str | Path) -> dict[str, np.ndarray]:
     """The columns of a run's ``metrics.csv``, each (n,) float64; an empty field is NaN.
 
     Raises:
-        ConfigError: there is no such file, or a field is no number.
+        ConfigError: the file is missing, or a field is no number.
     """
     columns = read_csv(path, ConfigError, "a run writes metrics.csv in its folder, see docs/training.md")
     return {name: column for name, column in columns.items() if len(column)}
@@ -30,9 +30,9 @@ def plot_curve(
 
     Args:
         metrics: the run's ``metrics.csv``.
-        path: where to.
-        random_walk: its success, drawn as a line.
-        title: above the picture.
+        path: of the PNG.
+        random_walk: success of the random walk, drawn as a line.
+        title: of the figure.
 
     Raises:
         ConfigError: see :func:`read_metrics`; or there are no rows.

@@ -1,4 +1,4 @@
-"""Learning curves of several seeds on one axis, with the band that they span."""
+"""Learning curves: mean and range over seeds."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ _PER_SCENE = ("success", "length", "length_ratio")
 
 
 def curve_names(runs: Sequence[LoggedRun]) -> list[str]:
-    """Columns of metrics.csv that the page draws: the general ones that any run logged, and the scenes'.
+    """Columns of metrics.csv on the page: the general ones that any run logged, and those per scene.
 
     >>> from pathlib import Path
     >>> log = dict.fromkeys(["frames", "success", "scene/hall/success", "lr"], np.ones(1))
@@ -46,17 +46,16 @@ def curve_names(runs: Sequence[LoggedRun]) -> list[str]:
 def band(
     curves: Sequence[tuple[np.ndarray, np.ndarray]], points: int = _POINTS
 ) -> dict[str, list[float | None]]:
-    """Mean, smallest and largest of several curves, on common frames.
+    """Mean, minimum and maximum of several curves on common frames.
 
-    Each curve is joined by straight lines between its own points. The band goes as far as all of them do, so
-    that it does not jump where one ends.
+    Curves are interpolated linearly, over the frames that all cover: a mean would jump where one ends.
 
     Args:
-        curves: pairs of frames (n,), rising, and values (n,); a NaN value is left out.
-        points: at most so many common frames, spread evenly over all that occur.
+        curves: pairs of frames (n,), rising, and values (n,); NaN values are left out.
+        points: most common frames, spread evenly over all that occur.
 
     Returns:
-        x, mean, low and high, lists of one length; None where no curve has a value.
+        x, mean, low and high, lists of one length.
 
     >>> one, two = np.array([0.0, 10.0, 20.0]), np.array([0.0, 20.0])
     >>> found = band([(one, np.array([0.0, 1.0, 2.0])), (two, np.array([4.0, 6.0]))])
@@ -80,14 +79,14 @@ def band(
 
 
 def learning_curves(runs: Sequence[LoggedRun]) -> list[dict[str, Any]]:
-    """The curves of every model and measure, for the page.
+    """The curves of every model and metric.
 
     Args:
         runs: those without a log are left out.
 
     Returns:
-        one dictionary for each model and measure: model, name (the column), seeds, and :func:`band`'s lists,
-        against frames; ``minutes``: the same frames as minutes of training, mean of the seeds.
+        a dictionary per model and metric: model, name (the column), seeds, the lists of :func:`band` over
+        frames, and ``minutes``: the same frames in minutes of training, mean over seeds.
     """
     found = []
     for label in dict.fromkeys(run.label for run in runs):
@@ -112,5 +111,5 @@ def _minutes(logs: Sequence[Mapping[str, np.ndarray]], frames: Sequence[float | 
 
 
 def _plain(values: np.ndarray) -> list[float | None]:
-    """Five significant digits: what a drawing can show."""
+    """Rounded to five significant digits, enough for a drawing."""
     return [float(f"{value:.5g}") if np.isfinite(value) else None for value in values]

@@ -1,7 +1,6 @@
-"""What an agent thinks of every state of a scene on the way to a goal, and how it walks there.
+"""Value, policy and successor features of an agent at every state of a scene, and sampled episodes.
 
-For each goal: the value and the policy at every state, the first principal components of psi, and sampled
-walks. An agent with several frames, or with a memory, is asked as it stands when an episode begins there.
+An agent with several frames, or with a memory, is evaluated as at the beginning of an episode.
 """
 
 from __future__ import annotations
@@ -32,7 +31,7 @@ __all__ = [
     "state_maps",
 ]
 
-_ROWS = 65536  # states and goals that go through the agent at once
+_ROWS = 65536  # pairs of state and goal per batch
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,7 +42,7 @@ class StateMaps:
         value: (G, N) V(s, g), in discounted reward.
         probabilities: (G, N, A) of the policy.
         components: (G, N, K) psi's first principal components, in the unit of psi; None without psi.
-        explained: (K,) share of psi's variance that each of them holds; None without psi.
+        explained: (K,) share of psi's variance that each explains; None without psi.
     """
 
     value: Tensor
@@ -56,14 +55,14 @@ class StateMaps:
 def state_maps(
     agent: Agent, scenes: SceneSet, scene: int, goals: Sequence[int], num_components: int = 3
 ) -> StateMaps:
-    """Asks an agent about every state of a scene, for some goals.
+    """Evaluate an agent at every state of a scene, for some goals.
 
     Args:
         agent: in evaluation mode, on the scenes' device.
         scenes: the world.
         scene: index of the scene.
         goals: G state ids within the scene.
-        num_components: K, at most.
+        num_components: K.
 
     >>> from vusfa.modules import make_agent
     >>> scenes = SceneSet.bundled(["bathroom"])
@@ -101,16 +100,14 @@ def state_maps(
 
 
 def principal_components(values: Tensor, count: int) -> tuple[Tensor, Tensor]:
-    """The first principal components of rows: their coordinates along the directions of largest variance.
-
-    The signs, which are free, are chosen so that the largest coordinate of each is positive.
+    """The first principal components of rows, each with the sign that makes its largest coordinate positive.
 
     Args:
         values: (n, E).
         count: K, at most E.
 
     Returns:
-        (n, K) coordinates about the mean, and (K,) the shares of the variance (0 where there is none).
+        (n, K) coordinates about the mean, and (K,) shares of the variance (0 where there is none).
 
     >>> line = torch.tensor([[0.0, 0.0], [1.0, 1.0], [2.0, 2.0]])
     >>> found, share = principal_components(line, 1)
@@ -130,24 +127,23 @@ def principal_components(values: Tensor, count: int) -> tuple[Tensor, Tensor]:
 def sampled_walks(
     agent: Agent, scenes: SceneSet, start: Tensor, goal: Tensor, max_steps: int = MAX_STEPS, seed: int = 0
 ) -> list[list[int]]:
-    """An agent's ways with actions drawn from its policy, see :func:`vusfa.evaluation.trails`."""
+    """Trajectories of an agent with sampled actions, see :func:`vusfa.evaluation.trails`."""
     observe, history = make_observation(agent, scenes), agent.config["history"]
     options: dict[str, Any] = {"max_steps": max_steps, "history": history, "seed": seed, "observe": observe}
     return trails(agent.get_policy_operator(), scenes, start, goal, **options)
 
 
 def choose_goals(scene: Scene, trained: Sequence[int], success: Tensor | None, count: int) -> list[int]:
-    """Which goals of a scene the explorer shows: trained ones, then failures, then poses far apart.
+    """Choose goals of a scene for the explorer: trained ones, then failures, then poses far apart.
 
     Args:
         scene: the scene.
-        trained: state ids of the goals trained on; they come first, sorted.
-        success: (N,) of each state as a goal, NaN where unknown; the lowest fill half of what is left,
-            those of 1 are no failures. None: not known.
-        count: goals in all.
+        trained: state ids of the trained goals; they come first, sorted.
+        success: (N,) of each state as a goal, NaN where unknown; the lowest below 1 fill half of the rest.
+        count: number of goals.
 
     Returns:
-        state ids without repeats, at most ``count``.
+        distinct state ids, at most ``count``.
 
     >>> room = Scene.bundled("bathroom")
     >>> success = torch.ones(176)
@@ -172,7 +168,7 @@ def choose_goals(scene: Scene, trained: Sequence[int], success: Tensor | None, c
 
 
 def choose_starts(scene: Scene, goal: int, count: int) -> list[int]:
-    """Starts from which a goal can be reached: the farthest one, then nearer ones in even steps.
+    """Choose starts that can reach a goal: the farthest one, then nearer ones in even steps.
 
     >>> room = Scene.bundled("bathroom")
     >>> starts = choose_starts(room, 73, 3)

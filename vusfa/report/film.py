@@ -1,4 +1,4 @@
-"""One walk as a short film: what the agent sees, what it looks for, and where it is."""
+"""An episode as a GIF: the agent's view, its goal, and the map."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ _INK, _PAPER = (60, 64, 72), (255, 255, 255)
 
 
 def longest_success(episodes: Episodes, scenes: SceneSet) -> tuple[int, int] | None:
-    """Start and goal, global ids, of the successful episode with the longest way to go; None when all failed.
+    """Start and goal, global ids, of the success with the longest shortest path; None if all episodes failed.
 
-    Of several the one with the fewest detours. Trained goals come first.
+    Trained goals come first, then shorter episodes.
     """
     found = [row for row in episodes.rows() if row["success"]]
     if not found:
@@ -46,19 +46,19 @@ def record_walk(
     attempts: int = 10,
     seed: int = 0,
 ) -> list[int]:
-    """The way of a policy with sampled actions.
+    """Trajectory of a policy with sampled actions.
 
     Args:
         policy: reads ``state_id``, ``goal_id`` and ``scene_id``, writes ``action``.
         scenes: the world, on the policy's device.
         start, goal: global state ids.
-        max_steps: actions allowed.
+        max_steps: limit of actions.
         history: frames in ``state_id``.
-        attempts: walks to try; the shortest of them that arrives is taken, the last one when none does.
-        seed: of the actions; the caller's random state is left as it was.
+        attempts: episodes, of which the shortest successful one is taken.
+        seed: of the actions; the caller's random state stays.
 
     Returns:
-        global ids of the states on the way, start and end included.
+        global ids of the visited states, start and end included.
     """
     starts, goals = torch.full((attempts,), start), torch.full((attempts,), goal)
     ways = trails(policy, scenes, starts, goals, max_steps=max_steps, history=history, seed=seed)
@@ -66,13 +66,13 @@ def record_walk(
 
 
 def draw_film(scenes: SceneSet, trail: Sequence[int], goal: int, scale: int = 2) -> list[Image.Image]:
-    """One picture a state of the way; a scene without pictures shows the map alone.
+    """One picture per visited state; a scene without pictures shows the map only.
 
     Args:
         scenes: the world.
-        trail: global ids of the states on the way.
+        trail: global ids of the visited states.
         goal: global id.
-        scale: how much larger than the scene's pictures.
+        scale: of the scene's pictures.
 
     >>> scenes = SceneSet.bundled(["bathroom"])
     >>> [picture.size for picture in draw_film(scenes, [72, 73], goal=73)]
@@ -81,7 +81,7 @@ def draw_film(scenes: SceneSet, trail: Sequence[int], goal: int, scale: int = 2)
     scene = scenes.scenes[int(scenes.scene_id[goal])]
     panels = {"map": ""}
     if scene.has_pictures:
-        panels = {"view": "what it sees", "goal": "what it looks for", **panels}
+        panels = {"view": "view", "goal": "goal", **panels}
     shortest = int(scenes.distance(trail[0], goal))
     film = []
     for step in range(len(trail)):
@@ -90,7 +90,7 @@ def draw_film(scenes: SceneSet, trail: Sequence[int], goal: int, scale: int = 2)
         picture = Image.new("RGB", (drawn.width, drawn.height + _TITLE_HEIGHT), _PAPER)
         picture.paste(drawn, (0, _TITLE_HEIGHT))
         draw = ImageDraw.Draw(picture)
-        words = dict(panels, map=f"step {step}, shortest way {shortest}")
+        words = dict(panels, map=f"step {step}, shortest path {shortest}")
         left = 0
         for panel, title in words.items():
             draw.text((left + 2, 3), title, fill=_INK, font=ImageFont.load_default(14))
@@ -101,7 +101,7 @@ def draw_film(scenes: SceneSet, trail: Sequence[int], goal: int, scale: int = 2)
 
 
 def write_gif(path: str | Path, film: Sequence[Image.Image], frames_per_second: float = 4.0) -> Path:
-    """Write a GIF that starts over after a pause on its last picture, atomically.
+    """Write a GIF that loops, with a pause on its last picture, atomically.
 
     Raises:
         ValueError: no pictures.
@@ -110,7 +110,7 @@ def write_gif(path: str | Path, film: Sequence[Image.Image], frames_per_second: 
         raise ValueError("a film needs at least one picture")
     pause = round(1000 / frames_per_second)
     durations = [pause] * (len(film) - 1) + [8 * pause]
-    # One palette for all pictures: each with its own would make the colours flicker.
+    # One palette for all pictures, so that the colors do not flicker.
     strip = Image.new("RGB", (film[0].width, film[0].height * min(len(film), 8)))
     for place, picture in enumerate(film[:: max(1, len(film) // 8)][:8]):
         strip.paste(picture, (0, place * picture.height))

@@ -1,4 +1,4 @@
-"""Where a scene's states lie on a floor map: each place a square, each heading a slice of it."""
+"""Floor maps: each place is a square, each heading a slice of it."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ _WHOLE = 359.9  # a slice of as many degrees is the whole square
 
 
 def slices(location: np.ndarray, rotation: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """A slice of a square for every state, so that no two states cover each other.
+    """A slice of a square per state, without overlaps.
 
-    States of one place share its square; each gets the angles that are nearer to its heading than to the
-    others'. Four headings give four triangles. Where two states have the same pose as well, the states are
-    laid out on a grid in the order of their ids instead, a square each: there is no map to draw.
+    States of one place share its square; each gets the angles nearest to its heading, so four headings give
+    four triangles. If two states have the same pose there is no map: all states are laid out on a grid in the
+    order of their ids, a square each.
 
     Args:
         location: (N, 2) metres.
@@ -90,7 +90,7 @@ def dart_path() -> str:
 
 
 def floor_plan(scene: Scene) -> dict[str, Any]:
-    """A scene's map as the page draws it, in squares from the upper left corner.
+    """A scene's map for the page, in squares from the upper left corner.
 
     Args:
         scene: the scene.

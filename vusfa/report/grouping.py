@@ -1,4 +1,4 @@
-"""Which runs are seeds of one thing: those of one label that agree in training and evaluation."""
+"""Runs that are seeds of one model: those of one label that agree in training and evaluation."""
 
 from __future__ import annotations
 

@@ -20,8 +20,8 @@ def intervals(tables: Sequence[pd.DataFrame], scene: str, names: Sequence[str]) 
     """Ends of the 95 % interval of every metric: ``name_from`` and ``name_to``, NaN where there is none.
 
     Args:
-        tables: K long tables, one per seed, of the goals that count.
-        scene: a scene's name, or that of a mean over scenes.
+        tables: K long tables, one per seed, of a subset of goals.
+        scene: name of a scene, or of a mean over scenes.
         names: metrics.
     """
     chosen = tables

@@ -1,8 +1,8 @@
-"""Numbers made small enough for a page: quantised, then the bytes in base 64.
+"""Compact arrays for a page: numbers quantized, then encoded in base 64.
 
 A packed array is a plain dictionary, ``{"type": "u8" | "u16", "shape": [...], "low": a, "high": b, "data":
-"..."}``. The reader divides each whole number by the largest one, 254 or 65534, and goes from ``low`` to
-``high``; 255 and 65535 stand for "no number". Without ``low`` the whole numbers are meant as they are.
+"..."}``. Levels 0 to 254, or 65534, are spread evenly from ``low`` to ``high``; 255 and 65535 stand for NaN.
+Without ``low`` the numbers are integers.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ _TYPES: dict[str, tuple[Any, int]] = {"u8": ("<u1", 254), "u16": ("<u2", 65534)}
 def pack(
     values: Any, kind: str = "u8", low: float | None = None, high: float | None = None
 ) -> dict[str, Any]:
-    """Quantise floats to 255 levels (``"u8"``) or 65535 (``"u16"``), evenly from ``low`` to ``high``.
+    """Quantize floats to 255 levels (``"u8"``) or 65535 (``"u16"``), evenly from ``low`` to ``high``.
 
     Args:
-        values: any shape; NaN stays NaN, what lies beyond the ends is moved to them.
+        values: any shape; NaN stays NaN, values beyond the ends are clipped.
         kind: ``"u8"`` or ``"u16"``.
-        low, high: the ends; the smallest and largest of the values when not given.
+        low, high: the ends; the smallest and largest value by default.
 
     Returns:
         a packed array, see the module.
@@ -46,7 +46,7 @@ def pack(
 
 
 def pack_ids(values: Any) -> dict[str, Any]:
-    """Whole numbers from 0 to 65535 as they are.
+    """Pack integers from 0 to 65535.
 
     >>> unpack(pack_ids([[3, 700]])).tolist()
     [[3, 700]]
@@ -58,7 +58,7 @@ def pack_ids(values: Any) -> dict[str, Any]:
 
 
 def unpack(packed: dict[str, Any]) -> np.ndarray:
-    """What the page's reader makes of a packed array: float64, or int64 for ids."""
+    """Unpack an array as the page does: float64, or int64 for ids."""
     dtype, most = _TYPES[packed["type"]]
     level = np.frombuffer(base64.b64decode(packed["data"]), dtype).reshape(packed["shape"])
     if "low" not in packed:

@@ -1,4 +1,4 @@
-"""One HTML file that holds everything it shows: its style, its scripts, Plotly, the numbers, the pictures."""
+"""The page as one HTML file with its style, scripts, Plotly, numbers and pictures."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _SCRIPTS = ("core.js", "charts.js", "floors.js", "explorer.js", "main.js")
 
 
 def as_json(content: Any) -> str:
-    """JSON that may stand within a ``<script>``; NaN and infinities, which JSON does not have, become null.
+    """JSON for a ``<script>`` element; NaN and infinities become null.
 
     >>> as_json({"a": [math.nan, 0.5], "b": "</script>"})
     '{"a":[null,0.5],"b":"<\\\\/script>"}'
@@ -69,7 +69,7 @@ def write_page(path: str | Path, content: Mapping[str, Any]) -> Path:
 
 
 def write_tables(folder: str | Path, tables: Mapping[str, Sequence[Mapping[str, Any]]]) -> list[Path]:
-    """Write each table as ``NAME.csv``, atomically; those without rows are left out.
+    """Write each table with rows as ``NAME.csv``, atomically.
 
     Returns:
         the paths.
@@ -82,7 +82,7 @@ def write_tables(folder: str | Path, tables: Mapping[str, Sequence[Mapping[str, 
 
 
 def even(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """The same rows, each with the columns of all; NaN where it has none.
+    """The same rows, each with the columns of all, filled with NaN.
 
     >>> even([{"a": 1}, {"b": 2}])
     [{'a': 1, 'b': nan}, {'a': nan, 'b': 2}]

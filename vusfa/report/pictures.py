@@ -1,4 +1,4 @@
-"""First-person pictures made small enough for a page."""
+"""Small first-person pictures for a page."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ __all__ = ["small_jpeg", "thumbnails"]
 
 
 def small_jpeg(picture: Any, width: int = 200, quality: int = 60) -> bytes:
-    """A picture (H, W, 3) uint8 as a JPEG file, scaled down to a width; smaller ones keep their size.
+    """A picture (H, W, 3) uint8 as JPEG, scaled down to a width at most.
 
     >>> import numpy as np
     >>> small_jpeg(np.zeros((150, 200, 3), np.uint8))[:2] == bytes([0xFF, 0xD8])
@@ -35,13 +35,13 @@ def thumbnails(scene: Scene, wanted: Sequence[int], budget: int) -> dict[str, An
     """Small pictures of a scene's states, as many as a budget allows.
 
     Args:
-        scene: the scene; without pictures there are none.
-        wanted: state ids in the order of their worth; the rest of the scene follows in the order of its ids.
-        budget: bytes that the JPEG files may take together.
+        scene: the scene, with or without pictures.
+        wanted: state ids, the most important first; the other states follow.
+        budget: bytes of all JPEG files together.
 
     Returns:
-        plain data: ``ids`` (n) of the states that have a picture, ``ends`` (n) where each file ends in
-        ``data``, the files one after the other in base 64.
+        plain data: ``ids`` (n) of the states with a picture, ``ends`` (n) of each file in ``data``, the
+        concatenated files in base 64.
 
     >>> found = thumbnails(Scene.bundled("bathroom"), [7, 3], budget=8000)
     >>> found["ids"][:2], len(found["ids"]) < 10

@@ -1,4 +1,4 @@
-"""Reads the folders that recipes/train.py and recipes/zero_shot.py leave, for a report."""
+"""Runs of ``vusfa train`` and ``vusfa evaluate``, read for a report."""
 
 from __future__ import annotations
 
@@ -50,18 +50,18 @@ class LoggedRun:
     """One training: its log, its checkpoint and its evaluation.
 
     Args:
-        label: what its model is called on the page; runs of one label are seeds of one thing.
+        label: of its model; runs of one label are seeds of one model.
         seed: of the training.
-        folder: where it was read from.
+        folder: of the run.
         settings: of the training, plain.
         curves: columns of metrics.csv by name, each (n,) float64 with NaN where nothing was logged.
         episodes: of its evaluation, or None.
-        references: the evaluation's rows of other policies (random walk, shortest path, ...).
+        references: rows of the evaluation's other policies (random walk, shortest path, ...).
         checkpoint: path of its weights, or None.
         variant: how actions were taken in the evaluation: "sampled" or "greedy".
         exact: its goals' exact probabilities, or None.
-        facts: frames and seconds of the training, where there is no log.
-        fingerprint: of the scenes it was trained in, where its folder tells; its checkpoint's comes first.
+        facts: frames and seconds of the training, if there is no log.
+        fingerprint: of the scenes of the training, if known; that of the checkpoint comes first.
     """
 
     label: str
@@ -99,17 +99,17 @@ class LoggedRun:
 
     @property
     def frames(self) -> float:
-        """Frames trained for; NaN where nothing tells."""
+        """Frames of the training; NaN if unknown."""
         return self.facts.get("frames", _last(self.curves, "frames"))
 
     @property
     def seconds(self) -> float:
-        """Wall-clock seconds of the training; NaN where nothing tells."""
+        """Wall-clock seconds of the training; NaN if unknown."""
         return self.facts.get("seconds", _last(self.curves, "seconds"))
 
     @property
     def scenes(self) -> list[str]:
-        """Names or files of the scenes it was trained in."""
+        """Names or files of the scenes of the training."""
         scenes = self.settings.get("scenes", [])
         return [scenes] if isinstance(scenes, str) else [str(scene) for scene in scenes]
 
@@ -120,13 +120,13 @@ def _last(curves: Mapping[str, np.ndarray], name: str) -> float:
 
 
 def read_run(source: str | Path) -> LoggedRun:
-    """Reads one run.
+    """Read one run.
 
     Args:
         source: its folder; ``LABEL=FOLDER`` calls its model LABEL.
 
     Raises:
-        ConfigError: no folder, no config.json in it, or a file in it that cannot be read.
+        ConfigError: there is no such folder, no config.json in it, or a file cannot be read.
 
     >>> read_run("vusfa=/no/such/folder")
     Traceback (most recent call last):
@@ -172,8 +172,7 @@ def _read_settings(path: Path) -> tuple[dict[str, Any], str]:
 
 
 def run_label(settings: Mapping[str, Any]) -> str:
-    """What a run's model is called unless it is given a name, see
-    :func:`~vusfa.evaluation.long_table.row_label`.
+    """Default label of a run's model, see :func:`~vusfa.evaluation.long_table.row_label`.
 
     >>> run_label({"agent": {"model": "usfa", "architecture": "paper"}})
     'usfa (paper)'
@@ -183,14 +182,14 @@ def run_label(settings: Mapping[str, Any]) -> str:
 
 
 def read_episodes(path: Path, max_steps: int) -> Episodes:
-    """An ``..._episodes.csv`` as :class:`~vusfa.evaluation.Episodes` writes it.
+    """Read an ``..._episodes.csv`` of :class:`~vusfa.evaluation.Episodes`.
 
     Args:
         path: the file.
-        max_steps: actions that were allowed in an episode.
+        max_steps: limit of actions per episode.
 
     Raises:
-        ConfigError: a column is missing, or holds something else than whole numbers.
+        ConfigError: a column is missing, or holds anything but integers.
     """
     content = read_csv(path, ConfigError, _AGAIN, words=["scene"])
     missing = [name for name in ("scene", *_COLUMNS) if name not in content]
@@ -214,7 +213,7 @@ def read_episodes(path: Path, max_steps: int) -> Episodes:
 
 
 def split_name(source: str | Path) -> tuple[str, Path]:
-    """``NAME=FOLDER`` as both; the name is empty where none is given.
+    """Split ``NAME=FOLDER``; the name is empty by default.
 
     >>> split_name("ours=runs/a")
     ('ours', PosixPath('runs/a'))
@@ -227,7 +226,7 @@ def split_name(source: str | Path) -> tuple[str, Path]:
 
 
 def _evaluation(folder: Path) -> tuple[Episodes | None, list[dict[str, Any]], str]:
-    """Of a run's evaluations the one with the most goals; of equals, recipes/zero_shot.py's."""
+    """The run's evaluation with the most goals; of equals, that of ``vusfa evaluate``."""
     found: list[tuple[int, Episodes, list[dict[str, Any]], str]] = []
     for stem in _EVALUATIONS:
         table, summary = folder / f"{stem}_episodes.csv", folder / f"{stem}.json"

@@ -1,4 +1,4 @@
-"""A report's tables: plain rows, made of the runs' episodes, the seeds of one model put together."""
+"""Tables of the page: plain rows, made from the runs' episodes and pooled over seeds."""
 
 from __future__ import annotations
 
@@ -31,15 +31,15 @@ Row = dict[str, Any]
 
 
 def long_table(runs: Sequence[LoggedRun], within: Sequence[int] = WITHIN) -> pd.DataFrame | None:
-    """The long table of all runs that were evaluated; None when none was."""
+    """The long table of all evaluated runs; None without any."""
     tables = [run.rows(within) for run in runs if run.episodes is not None]
     return join_tables(tables) if tables else None
 
 
 def over_seeds(rows: Sequence[Mapping[str, Any]], names: Sequence[str]) -> Row:
-    """Mean, smallest and largest of several rows: ``name``, ``name_low`` and ``name_high`` for each name.
+    """Mean, minimum and maximum of several rows: ``name``, ``name_low`` and ``name_high`` for each name.
 
-    A NaN, or a missing number, drops out; without any the three are NaN.
+    NaN and missing numbers are left out; without any number the three are NaN.
 
     >>> over_seeds([{"spl": 0.2}, {"spl": 0.4}, {}], ["spl"])
     {'spl': 0.30000000000000004, 'spl_low': 0.2, 'spl_high': 0.4}
@@ -54,11 +54,11 @@ def over_seeds(rows: Sequence[Mapping[str, Any]], names: Sequence[str]) -> Row:
 
 
 def seed_rows(runs: Sequence[LoggedRun], within: Sequence[int] = WITHIN) -> list[Row]:
-    """One row for each run, set of goals and scene: :func:`vusfa.evaluation.summary` with the seed beside it.
+    """One row per run, subset of goals and scene: :func:`vusfa.evaluation.summary` with the seed.
 
     Args:
         runs: those without an evaluation are left out.
-        within: numbers of actions to give the success for.
+        within: limits of actions to report success for.
     """
     return [
         {"model": run.label, "seed": run.seed} | {key: row[key] for key in row if key != "policy"}
@@ -71,17 +71,17 @@ def seed_rows(runs: Sequence[LoggedRun], within: Sequence[int] = WITHIN) -> list
 def summary_rows(
     runs: Sequence[LoggedRun], within: Sequence[int] = WITHIN, beside: Sequence[Mapping[str, Any]] = ()
 ) -> list[Row]:
-    """One row for each model, set of goals and scene; then the policies that the runs stand beside.
+    """One row per model, subset of goals and scene; then those of the baselines.
 
     Args:
         runs: those without an evaluation are left out.
-        within: numbers of actions to give the success for, see :func:`vusfa.evaluation.summary`.
-        beside: rows of other policies; those that the runs hold are added to them.
+        within: limits of actions to report success for.
+        beside: rows of baselines; those of the runs' own evaluations are added.
 
     Returns:
         rows with model, kind ("model" or "reference"), goals, scene, seeds, num_goals and num_episodes (of
-        one seed), and of every measure the mean, ``_low`` and ``_high`` over the seeds, and the ends
-        ``_from`` and ``_to`` of its 95 % interval, see :mod:`vusfa.report.intervals`.
+        one seed), and of every metric the mean, ``_low`` and ``_high`` over the seeds, and the ends ``_from``
+        and ``_to`` of its 95 % interval, see :mod:`vusfa.report.intervals`.
     """
     single = seed_rows(runs, within)
     names = metric_columns(single)
@@ -133,7 +133,7 @@ def reference_rows(run: LoggedRun, scenes: SceneSet, within: Sequence[int] = WIT
 
 
 def run_rows(runs: Sequence[LoggedRun]) -> list[Row]:
-    """One row per run: what was trained, how long, on what.
+    """One row per run: model, seed, length, device, scenes, goals and success of the training.
 
     >>> from pathlib import Path
     >>> run_rows([LoggedRun("gvf", 3, Path("runs/a"), {"scenes": "bathroom"})])[0]["seed"]
@@ -162,7 +162,7 @@ def run_rows(runs: Sequence[LoggedRun]) -> list[Row]:
 
 
 def _goals(run: LoggedRun) -> str:
-    """What was given as goals: ids, a rule, or a manifest, which is told by its name."""
+    """The setting of the goals: ids, a rule, or the name of a manifest."""
     goals = run.settings.get("env", {}).get("goals", "")
     return Path(goals).name if isinstance(goals, str) else str(goals)
 

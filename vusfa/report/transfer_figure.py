@@ -1,4 +1,4 @@
-"""The tables and the picture of the paper's Figure 2, from results alone: ``vusfa transfer show``."""
+"""Tables and figure of fine-tuning, the paper's Figure 2: ``vusfa transfer show``."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ _COLOURS = {"gvf": "#0072b2", "usfa": "#e69f00", "sfdp": "#009e73", "vusfa": "#c
 
 
 def mean_over(values: Sequence[Sequence[float]]) -> Estimate:
-    """The mean over seeds and sets of goals with its bootstrap interval; NaN drops out.
+    """Mean over seeds and sets of goals with its bootstrap interval, NaN left out.
 
     Args:
         values: of each seed, of each set.
@@ -144,8 +144,11 @@ def draw_transfer(
     path: str | Path,
     bounds: Mapping[str, Sequence[tuple[float, float]]] | None = None,
 ) -> Path:
-    """Episode length against frames, a panel a kind of goals, with 95 % bands, the random walk and the
-    shortest path in grey (``bounds``, see :func:`transfer_table`); as PNG, atomically."""
+    """Draw episode length over frames as PNG, atomically.
+
+    A panel per kind of goals, with 95 % bands and the baselines in gray (``bounds``, see
+    :func:`transfer_table`).
+    """
     from matplotlib.figure import Figure  # of the extra "recipes"
 
     kinds = [kind for kind in KINDS if any(run.info["kind"] == kind for run in runs)]
@@ -172,7 +175,7 @@ def draw_transfer(
         for index, style in enumerate(("--", "-.") if kind in (bounds or {}) else ()):
             height = mean_over([[pair[index] for pair in (bounds or {})[kind]]]).value
             panel.axhline(height, linestyle=style, color="#777777", lw=1, label=BOUNDS[index])
-    panels[0].set_ylabel("actions an episode")
+    panels[0].set_ylabel("actions per episode")
     handles, labels = panels[-1].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=5, frameon=False, fontsize=8)
     with replacing(path) as unfinished:
@@ -208,9 +211,8 @@ def show_transfer(
 
     Args:
         results: folder of results.
-        experiment: whose results.
-        threshold: actions an episode; the table tells after how many frames the mean comes down to it. Half
-            of those that are allowed when not given.
+        experiment: name of the experiment.
+        threshold: actions per episode; the table has the frames until the mean falls to it.
         scenes: bundled names and files, in order; the bundled rooms that the runs name when not given.
         out: the picture.
     """
