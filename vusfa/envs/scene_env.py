@@ -22,10 +22,7 @@ __all__ = ["SceneEnv", "usable_device"]
 
 
 def usable_device(device: torch.device | str) -> torch.device:
-    """The device of a name.
-
-    Raises:
-        ConfigError: there is no such device, or it cannot be used here.
+    """The device of a name; a ConfigError where it cannot be used here.
 
     >>> usable_device("cpu")
     device(type='cpu')

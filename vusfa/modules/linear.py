@@ -32,14 +32,9 @@ class SceneLinear(nn.Module):
     All scenes' weights are one parameter, where the released code has a variable per scene: an optimizer that
     clips by parameter sees them together.
 
-    Args:
-        num_scenes: n.
-        in_features: size of an input row.
-        out_features: size of an output row.
-
     Attributes:
-        weight: (n, out, in) float32.
-        bias: (n, out) float32.
+        weight: (num_scenes, out_features, in_features).
+        bias: (num_scenes, out_features).
 
     >>> layer = SceneLinear(3, 8, 5)
     >>> x, scene_id = torch.randn(4, 8), torch.tensor([2, 0, 2, 1])
@@ -143,14 +138,9 @@ class HistoryLinear(nn.Module):
     It is ``Linear(H * F, out)`` on concatenated frames. In this form a frame of many histories is multiplied
     once (:meth:`project`), and histories are sums of looked-up products (:meth:`gather`).
 
-    Args:
-        history: H.
-        in_features: F, size of a frame's features.
-        out_features: size of the output.
-
     Attributes:
-        weight: (H, out, F) float32; ``weight[h]`` belongs to frame h, oldest first.
-        bias: (out,) float32.
+        weight: (history, out_features, in_features); ``weight[h]`` belongs to frame h, oldest first.
+        bias: (out_features,).
 
     >>> layer = HistoryLinear(4, 6, 5)
     >>> frames = torch.randn(10, 6)                                   # ten different frames

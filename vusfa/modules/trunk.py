@@ -20,10 +20,6 @@ __all__ = ["CachedTrunk", "Fusion", "SceneLayer", "SiameseTrunk", "remember"]
 class Fusion(nn.Module):
     """Dense layer with ReLU on the concatenated embeddings of state and goal, shared by all scenes.
 
-    Args:
-        embedding_size: E.
-        hidden_size: outputs.
-
     >>> import torch
     >>> Fusion(16, 32)(torch.randn(5, 16), torch.randn(5, 16)).shape
     torch.Size([5, 32])
@@ -49,10 +45,6 @@ class Fusion(nn.Module):
 
 class SiameseTrunk(nn.Module):
     """Encoder and fusion as one module: only the sum of the fusion's two parts is computed row by row.
-
-    Args:
-        encoder: phi.
-        fusion: reads both embeddings.
 
     >>> import torch
     >>> from vusfa.modules.frames import FeatureFrames
@@ -178,11 +170,6 @@ class CachedTrunk:
 
 class SceneLayer(nn.Module):
     """A dense layer with ReLU, one per scene.
-
-    Args:
-        num_scenes: scenes with weights of their own.
-        in_features: size of a row.
-        hidden_size: outputs.
 
     >>> import torch
     >>> SceneLayer(2, 32, 32)(torch.randn(5, 32), torch.tensor([0, 1, 1, 0, 1])).shape
