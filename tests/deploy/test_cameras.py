@@ -159,7 +159,7 @@ def test_opencvs_pictures_are_turned_to_rgb_until_they_end(
             self.source, self.left = source, list(frames)
 
         def isOpened(self) -> bool:
-            return self.source != 7
+            return self.source not in (7, "bad.mp4")
 
         def read(self) -> tuple[bool, Any]:
             return (True, self.left.pop(0)) if self.left else (False, None)
@@ -168,7 +168,9 @@ def test_opencvs_pictures_are_turned_to_rgb_until_they_end(
             released.append(self.source)
 
     fake = SimpleNamespace(
-        VideoCapture=Capture, COLOR_BGR2RGB=4, cvtColor=lambda picture, _: picture[..., ::-1]
+        VideoCapture=Capture,
+        COLOR_BGR2RGB=4,
+        cvtColor=lambda picture, _: picture[..., ::-1],
     )
     monkeypatch.setitem(sys.modules, "cv2", fake)
     (tmp_path / "film").touch()
@@ -177,6 +179,9 @@ def test_opencvs_pictures_are_turned_to_rgb_until_they_end(
     assert found[-1][0, 0].tolist() == [60, 2, 1]
     assert len(found) == 2 or source == "0"  # a camera's older pictures are left out
     assert released == [0 if source == "0" else "film"]
+    (tmp_path / "bad.mp4").touch()
+    with pytest.raises(CameraError, match=r"camera 'bad.mp4': cannot be opened; it is no film"):
+        open_camera("bad.mp4")
     with pytest.raises(CameraError, match=r"camera '7': cannot be opened; check its number"):
         open_camera("7")
     monkeypatch.setitem(sys.modules, "cv2", None)

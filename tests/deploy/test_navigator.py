@@ -201,9 +201,10 @@ def test_photographs_are_turned_upright_and_cut(tmp_path: Path) -> None:
     sideways.save(tmp_path / "a.jpg", exif=exif)
     assert as_picture(tmp_path / "a.jpg")[0].shape == (30, 40, 3)
     wide = np.arange(100, dtype=np.uint8)[None, :, None].repeat(30, 0).repeat(3, 2)
-    cut = in_shape(wide, "wide", 150, 200, crop=True)
+    cut = in_shape(wide, "wide", [(150, 200)], crop=True)
     assert cut.shape == (30, 40, 3)
     assert cut[0, 0, 0] == 30
+    assert in_shape(wide, "wide", [(150, 200), (3, 10)]) is wide  # of one of the rooms
 
 
 @pytest.mark.skipif(not find_spec("efficientnet_lite_pytorch"), reason="needs vusfa[encode]")

@@ -225,6 +225,9 @@ def test_damaged_files_and_files_of_others_are_one_error(world: Any, tmp_path: P
         read_agent(
             written(scenes={"sources": [], "names": ["hall", "attic"], "fingerprint": "0"}), world.scenes
         )
+    weights["fusion.linear.bias"][0] = torch.nan
+    with pytest.raises(CheckpointError, match="its weights hold NaN or infinity"):
+        read_agent(written())
     bad.write_bytes(content[: len(content) // 2])
     with pytest.raises(CheckpointError, match=r"bad\.safetensors: no agent of vusfa"):
         read_agent(bad)

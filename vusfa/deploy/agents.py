@@ -204,6 +204,8 @@ def read_agent(path: str | os.PathLike[str], scenes: SceneSet | None = None) -> 
             header = json.loads((file.metadata() or {})["vusfa"])
             weights = {name: file.get_tensor(name).float() for name in file.keys()}
         _check_header(header)
+        if not all(bool(value.isfinite().all()) for value in weights.values()):
+            raise ValueError("its weights hold NaN or infinity")
     except (library.SafetensorError, OSError, KeyError, ValueError, TypeError, RecursionError) as error:  # type: ignore[union-attr]
         raise CheckpointError(
             f"{path}: no agent of vusfa ({brief(str(error))}); give a file of vusfa pretrained or push_to_hub"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import threading
 from collections.abc import Generator, Iterator
@@ -77,6 +78,8 @@ def _folder(path: Path) -> Iterator[np.ndarray]:
 
 
 def _opencv(source: int | str, name: str) -> Iterator[np.ndarray]:
+    os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")  # faults are raised here
+    os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
     try:
         cv2 = import_module("cv2")
     except ModuleNotFoundError as error:
@@ -86,9 +89,10 @@ def _opencv(source: int | str, name: str) -> Iterator[np.ndarray]:
     capture = cv2.VideoCapture(source)
     if not capture.isOpened():
         capture.release()
-        raise CameraError(
-            f"camera {brief(name)}: cannot be opened; check its number, or whether it is in use"
-        )
+        mend = "check its number, or whether it is in use"
+        if isinstance(source, str):
+            mend = "it is no film that OpenCV reads"
+        raise CameraError(f"camera {brief(name)}: cannot be opened; {mend}")
     if isinstance(source, str):
         return _of_film(cv2, capture)
     return _newest(_of_film(cv2, capture), name)

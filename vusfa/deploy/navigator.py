@@ -215,8 +215,11 @@ class Navigator:
 
     def _picture(self, picture: Any) -> tuple[np.ndarray, str]:
         array, name = as_picture(picture)
-        shape = self.scenes.scenes[0].picture_shape
-        return (in_shape(array, name, *shape[:2], crop=self._crop) if shape else array), name
+        rooms = (
+            [self.scenes.scenes[self.scenes.scene_index(self.scene)]] if self._named and self.scene else []
+        )
+        shapes = [room.picture_shape[:2] for room in rooms or self.scenes.scenes if room.picture_shape]
+        return (in_shape(array, name, shapes, crop=self._crop) if shapes else array), name
 
     @torch.inference_mode()
     def _observe(self, picture: np.ndarray) -> tuple[Tensor, Tensor]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import os
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -94,32 +95,33 @@ def as_picture(picture: Any) -> tuple[np.ndarray, str]:
     return array, name
 
 
-def in_shape(picture: np.ndarray, name: str, height: int, width: int, crop: bool = False) -> np.ndarray:
+def in_shape(
+    picture: np.ndarray, name: str, shapes: Sequence[tuple[int, int]], crop: bool = False
+) -> np.ndarray:
     """A picture of the same aspect ratio as the rooms' pictures.
 
     Args:
         picture: (H, W, 3) uint8.
         name: what messages call it.
-        height, width: of the rooms' pictures, pixels.
+        shapes: height and width of the rooms' pictures, pixels; one of them is enough.
         crop: cut the middle out of a picture of another aspect ratio, instead of an error.
 
     Raises:
         SceneError: another aspect ratio.
 
-    >>> in_shape(np.zeros((1080, 1920, 3), np.uint8), "goal.jpg", 150, 200, crop=True).shape
+    >>> in_shape(np.zeros((1080, 1920, 3), np.uint8), "goal.jpg", [(150, 200)], crop=True).shape
     (1080, 1440, 3)
     """
     rows, columns = picture.shape[:2]
-    if abs(columns * height / (rows * width) - 1) <= _SAME_ASPECT:
+    if any(abs(columns * high / (rows * wide) - 1) <= _SAME_ASPECT for high, wide in shapes):
         return picture
+    height, width = shapes[0]
     if not crop:
         raise SceneError(
             f"{name} is {columns} x {rows} pixels, the rooms' pictures are {width} x {height}; set the camera"
             " to that aspect ratio, or pass crop (--crop) to cut out the middle"
         )
-    new_rows, new_columns = (
-        min(rows, round(columns * height / width)),
-        min(columns, round(rows * width / height)),
-    )
+    new_rows = min(rows, round(columns * height / width))
+    new_columns = min(columns, round(rows * width / height))
     top, left = (rows - new_rows) // 2, (columns - new_columns) // 2
     return picture[top : top + new_rows, left : left + new_columns]
