@@ -50,6 +50,18 @@ def test_every_model_gets_its_loss_and_all_its_weights_a_gradient(rooms: SceneSe
     assert all(param.grad is not None and param.grad.isfinite().all() for param in agent.parameters())
 
 
+def test_coefficients_hold_for_the_terms_that_a_model_has(rooms: SceneSet):
+    """... such as a bottleneck of the state alone; and a part of what a term needs is an error."""
+    _, actor, critic, batch = parts(rooms, "vusfa")
+    keys = [key for key in critic.out_keys if key not in ("goal_loc", "goal_scale")]
+    loss, multiplier = make_usf_loss(actor, critic.select_out_keys(*keys), **COEFFICIENTS)
+    assert multiplier is not None
+    assert loss(batch)["beta"] == loss.state_dict()["bottleneck_coeff"] == 0.5
+    critic.reset_out_keys()
+    with pytest.raises(ConfigError, match=r"objective: .*no 'goal_scale'.*bottleneck_coeff=None"):
+        make_usf_loss(actor, critic.select_out_keys(*keys, "goal_loc"), **COEFFICIENTS)
+
+
 def test_gvf_is_plain_advantage_actor_critic(rooms: SceneSet):
     # torchrl's A2CLoss has no coefficient for the policy's term
     _, actor, critic, batch = parts(rooms, "gvf")

@@ -42,7 +42,7 @@ def threads_per_step(settings: Mapping[str, Any]) -> int | None:
     >>> threads_per_step({"optim": optim, "collector": {"kind": "single", "num_envs": 100}})
     100
     """
-    optim = settings.get("optim", {})  # an algorithm of one's own may have no settings at all
+    optim = settings.get("optim", {})  # your own algorithm may have no settings at all
     if optim.get("kind") != "a3c_rmsprop":
         return None
     collector = settings["collector"]

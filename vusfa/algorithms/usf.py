@@ -23,8 +23,8 @@ __all__ = ["USF", "make_usf_loss"]
 # arguments of USFEstimator and of DualAscent among the settings of objective; the others are USFLoss's
 _OF_TARGETS = ("gamma", "lmbda", "normalize_advantage", "min_advantage_std", "bootstrap_at_timeout")
 _OF_ASCENT = {"bottleneck_step_size": "step_size", "threads": "threads"}
-# coefficients that the settings have for every model, and what a critic with such a term writes
-_OF_SOME_MODELS = {"successor_coeff": "successor_features", "bottleneck_coeff": "goal_loc"}
+# coefficients that the settings have for every model, whether or not its critic has the term
+_OF_SOME_MODELS = ("successor_coeff", "bottleneck_coeff")
 # buffers of the loss that training moves; the others are settings
 _ADAPTED = ("bottleneck_coeff", "last_kl")
 
@@ -53,10 +53,12 @@ def make_usf_loss(
     """
     ascent = {argument: objective.pop(name) for name, argument in _OF_ASCENT.items() if name in objective}
     targets = {name: objective.pop(name) for name in _OF_TARGETS if name in objective}
-    without = [name for name, key in _OF_SOME_MODELS.items() if key not in critic.out_keys]
-    objective |= dict.fromkeys(without, "auto")
+    optional = {name: objective.pop(name) for name in _OF_SOME_MODELS if name in objective}
     try:
         loss = USFLoss(actor, critic, distinct=True, **objective)
+        for name, value in optional.items():
+            setattr(loss, name, value)
+        loss.check()
         loss.make_value_estimator(USFEstimator(value_network=critic, **targets))
         return loss, DualAscent(loss, **ascent) if loss.has_bottleneck else None
     except ValueError as error:
@@ -126,7 +128,7 @@ class USF(Algorithm):
 
 
 def _by_scene(batch: TensorDictBase) -> TensorDictBase:
-    """The rows in order of their scenes, where every row stays in one: no layer need sort them again."""
+    """The rows sorted by scene, where every row stays in one: no layer has to sort them again."""
     scene = batch.get("scene_id", None)
     if scene is None or scene.is_cuda or scene.dim() != 2:
         return batch
