@@ -106,7 +106,7 @@ def test_an_unknown_scene(run):
         ("collector.num_envs=many", "collector.num_envs is 'many'; it must be a whole number"),
         (
             "collector.kind=multi",
-            "collector.kind is 'multi'; it must be one of single, multi_sync, multi_async",
+            "collector.kind is 'multi'; it must be one of single, multi_sync, multi_async, hogwild",
         ),
         ("logger.kinds=[cvs]", "logger.kinds holds 'cvs'"),
         ("objective.gamma=1.5", "objective: USFEstimator: gamma is 1.5"),

@@ -64,11 +64,16 @@ def signal_worker(number: int, trainer: Trainer) -> None:
 @pytest.mark.usefixtures("fast_workers")
 @pytest.mark.parametrize(
     ("kind", "number"),
-    [("multi_sync", signal.SIGKILL), ("multi_async", signal.SIGTERM), ("multi_async", signal.SIGSEGV)],
+    [
+        ("multi_sync", signal.SIGKILL),
+        ("multi_async", signal.SIGTERM),
+        ("multi_async", signal.SIGSEGV),
+        ("hogwild", signal.SIGKILL),
+    ],
 )
 def test_a_worker_that_dies(tmp_path: Path, kind: str, number: signal.Signals):
     path = tmp_path / "checkpoint.pt"
-    text = ended_by(partial(signal_worker, number), path, f"collector={kind}")
+    text = ended_by(partial(signal_worker, number), path, f"collector={kind}", "optim=a3c")
     assert text.startswith("worker 1 of the collector (process ")
     assert f"was ended by {number.name}" in text
     frames = load_checkpoint(path)["frames"]

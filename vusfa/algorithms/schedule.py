@@ -46,7 +46,7 @@ def threads_per_step(settings: Mapping[str, Any]) -> int | None:
     if optim.get("kind") != "a3c_rmsprop":
         return None
     collector = settings["collector"]
-    workers = collector["num_workers"] if collector["kind"] == "multi_async" else 1
+    workers = collector["num_workers"] if collector["kind"] in ("multi_async", "hogwild") else 1
     threads = collector["num_envs"] // workers
     given = optim["options"].get("threads_per_update")
     if given is None:

@@ -98,15 +98,24 @@ class TFRMSprop(Optimizer):
                 continue
             if param.grad.is_sparse:
                 raise RuntimeError("TFRMSprop does not take sparse gradients; use dense embeddings")
-            state = self.state[param]
-            if not state:
-                state["square_avg"] = torch.full_like(
-                    param, group["initial_accumulator"], memory_format=torch.preserve_format
-                )
             params.append(param)
             grads.append(param.grad)
-            accumulators.append(state["square_avg"])
+            accumulators.append(self._accumulator(param, group))
         return params, grads, accumulators
+
+    def _accumulator(self, param: Tensor, group: dict[str, Any]) -> Tensor:
+        state = self.state[param]
+        if not state:
+            state["square_avg"] = torch.full_like(
+                param, group["initial_accumulator"], memory_format=torch.preserve_format
+            )
+        return state["square_avg"]
+
+    def share_memory(self) -> None:
+        """Move the accumulators of all parameters to shared memory, for several processes to update."""
+        for group in self.param_groups:
+            for param in group["params"]:
+                self._accumulator(param, group).share_memory_()
 
 
 def _update_foreach(

@@ -15,6 +15,7 @@ from vusfa.training.checkpoint import (
 from vusfa.training.collectors import check_goals_dealt, make_collector, make_env
 from vusfa.training.facts import machine_facts, run_facts
 from vusfa.training.folder import RunFolder
+from vusfa.training.hogwild import HogwildTrainer
 from vusfa.training.loggers import make_loggers
 from vusfa.training.metrics import EpisodeMeter, MeanMeter
 from vusfa.training.optimization import descend, make_optimizer, total_loss
@@ -28,6 +29,7 @@ from vusfa.training.trainer import Trainer
 __all__ = [
     "EpisodeMeter",
     "EvaluationProgress",
+    "HogwildTrainer",
     "MeanMeter",
     "ProgressLine",
     "RunFolder",

@@ -5,6 +5,7 @@
 ``multi_sync``   worker processes collect with the same weights and wait for each other; a batch has all rows.
 ``multi_async``  worker processes never wait: a batch has the rows of the first that is ready. Weights are in
                  shared memory, so an update reaches workers in mid-rollout: A3C.
+``hogwild``      worker processes train, too: :mod:`vusfa.training.hogwild`.
 ===============  ============================================================================================
 
 Rows get the same goals however they are spread over processes.
@@ -44,7 +45,7 @@ __all__ = [
     "rows_per_worker",
 ]
 
-KINDS = ("single", "multi_sync", "multi_async")
+KINDS = ("single", "multi_sync", "multi_async", "hogwild")
 
 MakeEnv = Callable[..., EnvBase]
 

@@ -66,6 +66,12 @@ class EpisodeMeter:
         rows = [torch.ones_like(length), success, length, success * length, success * shortest]
         self._sums.index_add_(1, column, torch.stack(rows))
 
+    def add(self, state: Mapping[str, Tensor]) -> None:
+        """Adds the sums of another meter for the same goals, its :meth:`state_dict`."""
+        self._sums += state["sums"]
+        self._frames += int(state["frames"])
+        self._collisions += state["collisions"].to(torch.int64)
+
     def flush(self) -> dict[str, float]:
         """Return the rates since the last call, and start over.
 

@@ -17,6 +17,7 @@ from vusfa.modules import Agent, make_agent
 from vusfa.scenes import SceneSet
 from vusfa.training.checkpoint import load_checkpoint
 from vusfa.training.collectors import check_goals_dealt, make_collector, make_env, rows_per_worker
+from vusfa.training.hogwild import HogwildTrainer
 from vusfa.training.memory import keep_memory
 from vusfa.training.optimization import make_optimizer
 from vusfa.training.precision import resolve_autocast
@@ -74,18 +75,20 @@ def make_trainer(
             **settings["collector"],
         )
 
-    return Trainer(
-        scenes,
-        goals,
-        agent,
-        algorithm,
-        optimizer,
-        collector,
-        settings,
-        overrides,
-        observation=observation,
-        note=note,
-    )
+    parts: dict[str, Any] = {
+        "scenes": scenes,
+        "goals": goals,
+        "agent": agent,
+        "algorithm": algorithm,
+        "optimizer": optimizer,
+        "settings": settings,
+        "overrides": overrides,
+        "observation": observation,
+        "note": note,
+    }
+    if settings["collector"]["kind"] == "hogwild":
+        return HogwildTrainer(make_env=env, **parts)
+    return Trainer(make_collector=collector, **parts)
 
 
 def decide_autocast(settings: Mapping[str, Any]) -> bool:

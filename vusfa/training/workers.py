@@ -22,7 +22,7 @@ from torchrl.collectors import BaseCollector
 
 from vusfa.errors import VusfaError, WorkerError
 
-__all__ = ["begin_worker", "started", "supervised", "watch"]
+__all__ = ["begin_worker", "end_of", "started", "supervised", "watch"]
 
 #: What one wait, or one update between two waits, counts at most towards a time limit, in seconds: a
 #: training that was suspended (Ctrl-Z, a laptop's lid) does not hold that against its workers.
@@ -68,7 +68,7 @@ def started(limit: float | None) -> Iterator[None]:
 
     def look(number: int, frame: FrameType | None) -> None:
         seen.update(child for child in multiprocessing.active_children() if child not in before)
-        dead = [_end_of(child.pid, child.exitcode) for child in seen if child.exitcode is not None]
+        dead = [end_of(child.pid, child.exitcode) for child in seen if child.exitcode is not None]
         if dead:
             raise WorkerError(dead[0])
         if limit is not None and time.monotonic() - began > limit:
@@ -179,11 +179,12 @@ def _dead(workers: Sequence[Any]) -> str | None:
     for index, worker in enumerate(workers):
         with suppress(ValueError):  # TorchRL has closed those that it ended itself
             if worker.exitcode is not None:
-                return _end_of(worker.pid, worker.exitcode, index)
+                return end_of(worker.pid, worker.exitcode, index)
     return None
 
 
-def _end_of(pid: int | None, code: int, index: int | None = None) -> str:
+def end_of(pid: int | None, code: int, index: int | None = None) -> str:
+    """How a worker process has ended, in words."""
     name = "a worker of the collector" if index is None else f"worker {index} of the collector"
     if code < 0:
         try:
