@@ -117,6 +117,17 @@ def test_a_checkpoint_with_weights_that_are_no_numbers(
         gather([read_run(run)])
 
 
+@pytest.mark.parametrize("goal", [-1, 580, 10**9])
+def test_a_checkpoint_with_goals_beyond_its_scenes(
+    run_folders: list[Path], tmp_path: Path, goal: int
+) -> None:
+    state = torch.load(run_folders[2] / "checkpoint.pt", weights_only=True)
+    state["goals"][0] = goal
+    torch.save(state, tmp_path / "a.pt")
+    with pytest.raises(CheckpointError, match=r"a\.pt: its entry 'goals' names states beyond the 580"):
+        load_agent(tmp_path / "a.pt")
+
+
 def logged(label: str, seed: int, frames: float = 100.0, **settings: Any) -> LoggedRun:
     log = {"frames": np.array([0.0, frames]), "success": np.array([0.0, 1.0])}
     return LoggedRun(label, seed, Path(f"{label}-{seed}"), {"seed": seed, **settings}, log)
@@ -127,6 +138,14 @@ def logged(label: str, seed: int, frames: float = 100.0, **settings: Any) -> Log
     [
         ([logged("a", 0, total_frames=5), logged("a", 1, total_frames=5)], ["a", "a"]),
         ([logged("a", 0, folder="x"), logged("a", 1, folder="y", device="cuda")], ["a", "a"]),
+        (
+            [
+                logged("a", 0, overrides=["preset=fast"]),
+                logged("a", 1, overrides=["preset=fast", "optim.lr=1"]),
+            ],
+            ["a, optim.lr=default", "a, optim.lr=1"],
+        ),
+        ([logged("a", 0, overrides=["preset=fast"]), logged("a", 1)], ["a", "a"]),
         ([logged("a", 0), logged("a", 1, scenes=["rooms/x.h5"])], ["a, scenes=[]", "a, scenes=['x']"]),
         (
             [logged("a", 0, optim={"lr": 0.1}), logged("b", 0), logged("a", 1, optim={"lr": 0.2})],

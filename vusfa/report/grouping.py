@@ -43,6 +43,7 @@ def separate_runs(runs: Sequence[LoggedRun]) -> tuple[list[LoggedRun], list[str]
         places = [place for place, run in enumerate(runs) if run.label == label]
         longest = max(runs[place].frames if runs[place].curves else 0 for place in places)
         facts = [_facts(runs[place], longest) for place in places]
+        _spread_overrides(facts)
         told = dict.fromkeys(name for found in facts for name in found)
         names = [name for name in told if _differ(name, facts)]
         if not names:
@@ -72,6 +73,20 @@ def _facts(run: LoggedRun, longest: float) -> dict[str, Any]:
         goals = torch.stack([run.episodes.scene, run.episodes.goal]).unique(dim=1)
         facts["evaluated goals"] = (run.episodes.scene_names, goals.tolist())
     return facts
+
+
+def _spread_overrides(facts: Sequence[dict[str, Any]]) -> None:
+    """Results keep their command line instead of all settings: what one of them gives, the others leave."""
+    given = [
+        dict(str(text).partition("=")[::2] for text in found.pop("overrides"))
+        if "overrides" in found
+        else None
+        for found in facts
+    ]
+    names = dict.fromkeys(name for overrides in given for name in overrides or ())
+    for found, overrides in zip(facts, given, strict=True):
+        if overrides is not None:
+            found |= {name: overrides.get(name, "default") for name in names}
 
 
 def _differ(name: str, facts: Sequence[dict[str, Any]]) -> bool:

@@ -229,6 +229,9 @@ def load_agent(
 def saved_agent(path: str | Path, state: Mapping[str, Any], scenes: SceneSet) -> Agent:
     """The agent of a checkpoint's content, in evaluation mode; errors of :func:`load_agent`."""
     check_scenes(path, state["scenes"], scenes)
+    goals = state["goals"]
+    if not bool(((goals >= 0) & (goals < scenes.num_states)).all()):
+        raise mended(path, f"its entry 'goals' names states beyond the {scenes.num_states} of its scenes")
     try:
         agent = rebuild_agent(state["agent_config"], scenes).to(scenes.device)
     except VusfaError as error:
