@@ -130,9 +130,9 @@ def test_columns_of_a_csv_file(tmp_path: Path) -> None:
     assert columns["name"] == ["a, b", "c"]
     np.testing.assert_array_equal(columns["x"], [1.0, np.nan])
     for text, fault in (
-        ("x\n1,2\n", "line 2 has 2 fields"),
-        ("x,x\n", "names a column twice"),
-        ("x\n1\nb\n", "line 3 .could not convert string"),
+        ("x\n1,2\n", "row 2 .2 fields, and 1 columns"),
+        ("x,x\n", "a column is named twice"),
+        ("x\n1\nb\n", "row 3 .could not convert string"),
         ("x\n" + "1" * 200_000, "field larger than field limit"),
     ):
         path.write_text(text)

@@ -51,8 +51,8 @@ MAX_TEXT_BYTES = 1 << 20
 MAX_YAML_DEPTH, MAX_YAML_NODES, MAX_YAML_SCALAR = 20, 100_000, 10_000
 #: Size of a JSON file; Python's objects take up to 30 times that.
 MAX_JSON_BYTES = 1 << 24
-#: Size of a CSV file; its numbers take up to four times that.
-MAX_CSV_BYTES = 1 << 27
+#: Size of a CSV file, read at some 3 MB per second; different words in it.
+MAX_CSV_BYTES, MAX_CSV_WORDS = 1 << 25, 100_000
 #: Size of a CSV file of poses or moves, which become Python's objects.
 MAX_TABLE_BYTES = 1 << 24
 #: Pieces of furniture, and entries of any other kind, of a plan.

@@ -59,21 +59,27 @@ def read_text(
     vusfa.errors.ConfigError: /dev/zero: cannot be read (it is no regular file); give a file
     """
     try:
-        return _bytes(path, most).decode(encoding)
+        with open_regular(path, most) as file:
+            return file.read().decode(encoding)
     except FileNotFoundError as fault:
         raise error(f"{path}: cannot be read (there is no such file); {mend}") from fault
     except (OSError, UnicodeDecodeError) as fault:
         raise error(f"{path}: cannot be read ({fault}); {mend}") from fault
 
 
-def _bytes(path: str | os.PathLike[str], most: int) -> bytes:
+def open_regular(path: str | os.PathLike[str], most: int | None = None) -> BinaryIO:
+    """Open a regular file of at most ``most`` bytes.
+
+    Raises:
+        OSError: it is none, has more bytes, or cannot be read.
+    """
     if os.path.exists(path) and not os.path.isfile(path):
         raise OSError("it is no regular file")
-    with open(path, "rb") as file:
-        content = file.read(most + 1)
-    if len(content) > most:
+    file = open(path, "rb")  # noqa: SIM115
+    if most is not None and os.fstat(file.fileno()).st_size > most:
+        file.close()
         raise OSError(f"it has more than {most} bytes")
-    return content
+    return file
 
 
 def read_yaml(path: str | os.PathLike[str], error: type[VusfaError], mend: str) -> Any:
@@ -170,29 +176,34 @@ def read_csv(
     Returns:
         columns by name: (n,) float64, NaN where a field is empty or a line ends early; ``words`` as lists.
     """
-    text = read_text(path, error, mend, limits.MAX_CSV_BYTES)
-    reader = csv.reader(io.StringIO(text, newline=""))
+    row = 1
     try:
-        names = next(reader, [])
-        if len(set(names)) < len(names):
-            raise ValueError("line 1 names a column twice")
-        columns: list[Any] = [[] if name in words else array("d") for name in names]
-        shared: dict[str, str] = {}
-        for fields in reader:
-            if len(fields) > len(names):
-                raise ValueError(f"line {reader.line_num} has {len(fields)} fields, line 1 {len(names)}")
-            fields += [""] * (len(names) - len(fields))
-            for column, field in zip(columns, fields, strict=True):
-                if isinstance(column, list):
-                    column.append(shared.setdefault(field, field))
-                else:
-                    column.append(float(field or "nan"))
+        with open_regular(path, limits.MAX_CSV_BYTES) as binary:
+            reader = csv.reader(io.TextIOWrapper(binary, encoding="utf-8", newline=""))
+            names = next(reader, [])
+            if len(set(names)) < len(names):
+                raise ValueError("a column is named twice")
+            texts: dict[int, list[str]] = {place: [] for place, name in enumerate(names) if name in words}
+            numbers, shared = array("d"), dict[str, str]()
+            for fields in reader:
+                row += 1
+                if len(fields) != len(names):
+                    if len(fields) > len(names):
+                        raise ValueError(f"{len(fields)} fields, and {len(names)} columns")
+                    fields += [""] * (len(names) - len(fields))
+                numbers.extend([float(x) if x else math.nan for k, x in enumerate(fields) if k not in texts])
+                for place, column in texts.items():
+                    column.append(shared.setdefault(fields[place], fields[place]))
+                if len(shared) > limits.MAX_CSV_WORDS:
+                    raise ValueError(f"more than {limits.MAX_CSV_WORDS} different words")
+    except FileNotFoundError as fault:
+        raise error(f"{path}: cannot be read (there is no such file); {mend}") from fault
+    except OSError as fault:
+        raise error(f"{path}: cannot be read ({fault}); {mend}") from fault
     except (csv.Error, ValueError) as fault:
-        raise error(f"{path}: cannot be read as CSV, line {reader.line_num} ({fault}); {mend}") from fault
-    return {
-        name: column if isinstance(column, list) else np.array(column)
-        for name, column in zip(names, columns, strict=True)
-    }
+        raise error(f"{path}: cannot be read as CSV, row {row} ({fault}); {mend}") from fault
+    table = iter(np.array(numbers).reshape(-1, max(1, len(names) - len(texts))).T)
+    return {name: texts[place] if place in texts else next(table) for place, name in enumerate(names)}
 
 
 class BoundedZip(zipfile.ZipFile):
@@ -214,8 +225,7 @@ class BoundedZip(zipfile.ZipFile):
     _opened: _File | None = None
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
-        if os.path.exists(path) and not os.path.isfile(path):
-            raise OSError("it is no regular file")
+        open_regular(path).close()
         self._opened = opened = self._File(io.FileIO(path))
         try:
             super().__init__(opened)
@@ -282,9 +292,7 @@ def _read_array(file: BinaryIO, size: int) -> np.ndarray:
 def read_npy(path: str | os.PathLike[str], error: type[VusfaError], mend: str) -> np.ndarray:
     """Read a .npy file of numbers, truth values or text, no pickles; see :func:`read_text`."""
     try:
-        if os.path.exists(path) and not os.path.isfile(path):
-            raise OSError("it is no regular file")
-        with open(path, "rb") as file:
+        with open_regular(path) as file:
             return _read_array(file, os.fstat(file.fileno()).st_size)
     except FileNotFoundError as fault:
         raise error(f"{path}: cannot be read (there is no such file); {mend}") from fault

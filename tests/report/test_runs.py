@@ -73,7 +73,7 @@ def test_curves_with_gaps(tmp_path: Path):
         ("config.json", "{", "config.json: cannot be read"),
         ("config.json", "[]", "holds \\[\\] in place of an object"),
         ("config.json", "{}", "field 'agent.model' is missing"),
-        ("metrics.csv", "frames\nmany\n", "line 2 .could not convert string to float: .many."),
+        ("metrics.csv", "frames\nmany\n", "row 2 .could not convert string to float: .many."),
         ("evaluation_episodes.csv", "scene,goal\nhall,1\n", "column 'start' is missing"),
         ("evaluation_episodes.csv", "scene,goal\n", "column .start. is missing"),
     ],
