@@ -91,7 +91,8 @@ def test_a_run_learns_and_tells(recipe, settings, small, tmp_path: Path, capsys:
     assert "random walk" in written.out
     assert "24,000 of 24,000 frames" in written.err
     state = load_checkpoint(tmp_path / "run" / "checkpoint.pt")
-    assert state["overrides"] == options
+    assert state["overrides"][:2] == options[:2]
+    assert str(tmp_path) not in f"{state['config']} {state['overrides']}"  # an absolute path of its author's
     assert state["scenes"]["names"] == ["hall"]
 
 

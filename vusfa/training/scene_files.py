@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 from vusfa.scenes import bundled_names
 
-__all__ = ["find_source", "scene_sources"]
+__all__ = ["PLACES", "find_source", "scene_sources", "without_places"]
+
+#: Settings that say where something is, and that a resumed run does not take from its checkpoint.
+PLACES = ("scenes", "folder", "resume")
 
 
 def scene_sources(scenes: str | Sequence[str], folder: str | Path) -> list[str]:
@@ -32,3 +37,16 @@ def find_source(source: str, checkpoint: Path) -> str:
     place = Path(os.path.normpath(folder / source))
     beside = folder / place.name
     return str(beside if beside.is_file() and not place.exists() else place)
+
+
+def without_places(value: Any) -> Any:
+    """Plain data whose absolute paths keep their last part: a checkpoint tells nothing of its author's disk.
+
+    >>> without_places(["folder=/home/me/runs/a", "scenes=[/x/y/hall.h5,kitchen]", "seed=1"])
+    ['folder=.../a', 'scenes=[.../hall.h5,kitchen]', 'seed=1']
+    """
+    if isinstance(value, list):
+        return [without_places(item) for item in value]
+    if not isinstance(value, str):
+        return value
+    return re.sub(r"(?<![\w.$:/])/(?:[^/,'\"\[\]]+/)*([^/,'\"\[\]]+)", r".../\1", value)
