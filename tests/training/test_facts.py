@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+import subprocess
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -36,3 +38,16 @@ def test_facts_of_the_machine() -> None:
     assert facts["versions"]["torch"] == torch.__version__
     assert facts["cores"] >= 1
     assert facts["processor"]
+
+
+def test_facts_name_the_commit_of_a_checkout(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    def git(*words: str) -> str:
+        command = ["git", "-C", str(tmp_path), "-c", "user.name=a", "-c", "user.email=a@b.c", *words]
+        return subprocess.run(command, check=True, capture_output=True, text=True).stdout.strip()
+
+    monkeypatch.setattr("vusfa.training.facts.__file__", str(tmp_path / "vusfa" / "training" / "facts.py"))
+    assert machine_facts()["commit"] is None
+    git("init", "-q")
+    assert machine_facts()["commit"] is None  # nothing is committed yet
+    git("commit", "-q", "--allow-empty", "-m", "first")
+    assert machine_facts()["commit"] == git("rev-parse", "HEAD")

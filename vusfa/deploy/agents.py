@@ -213,8 +213,9 @@ def read_agent(path: str | os.PathLike[str], scenes: SceneSet | None = None) -> 
     check_sizes(path, header["agent_config"], weights)
     if scenes is None:
         scenes = SceneSet.open([find_source(source, path) for source in header["scenes"]["sources"]])
-    agent = saved_agent(path, {**header, "agent": weights}, scenes)
-    return TrainedAgent(agent, scenes, torch.tensor(header["goals"]))
+    goals = torch.tensor(header["goals"], dtype=torch.int64)
+    agent = saved_agent(path, {**header, "agent": weights, "goals": goals}, scenes)
+    return TrainedAgent(agent, scenes, goals)
 
 
 def _check_header(header: Any) -> None:

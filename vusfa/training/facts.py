@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import os
 import platform
+import subprocess
 from collections.abc import Mapping, Sequence
 from importlib.metadata import version
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -17,12 +19,13 @@ __all__ = ["machine_facts", "run_facts"]
 
 
 def machine_facts() -> dict[str, Any]:
-    """Processor, cores, Python and the versions of the libraries that compute.
+    """Processor, cores, Python, the versions of the libraries that compute, and the commit of a checkout.
 
     >>> sorted(machine_facts())
-    ['cores', 'gpu', 'processor', 'python', 'versions']
+    ['commit', 'cores', 'gpu', 'processor', 'python', 'versions']
     """
     return {
+        "commit": _commit(),
         "processor": _processor(),
         "cores": os.cpu_count(),
         "gpu": torch.cuda.get_device_name() if torch.cuda.is_available() else None,
@@ -55,6 +58,18 @@ def run_facts(state: Mapping[str, Any], overrides: Sequence[str] = ()) -> dict[s
         "precision": precision_name(resolve_autocast(config["autocast"], config["device"])),
         **machine_facts(),
     }
+
+
+def _commit() -> str | None:
+    """Commit that is checked out where the package lies; None for an installed one."""
+    root = Path(__file__).parents[2]
+    if not (root / ".git").exists():
+        return None
+    try:
+        command = ["git", "-C", str(root), "rev-parse", "HEAD"]
+        return subprocess.run(command, capture_output=True, text=True, check=True, timeout=10).stdout.strip()
+    except (OSError, subprocess.SubprocessError):
+        return None
 
 
 def _processor() -> str:
