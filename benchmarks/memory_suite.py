@@ -89,5 +89,7 @@ def growth(overrides: Sequence[str], updates: int) -> float:
 
 def _apart(function: object, *arguments: object) -> float:
     """The function's result, computed in a process of its own."""
-    with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as pool:
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload(["benchmarks.trainer"])  # imported once, for all
+    with ProcessPoolExecutor(1, mp_context=context) as pool:
         return pool.submit(function, *arguments).result()  # type: ignore[arg-type]

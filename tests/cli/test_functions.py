@@ -10,7 +10,7 @@ from typing import Literal
 import pytest
 from typer.testing import CliRunner
 
-from vusfa.cli import FUNCTIONS
+from vusfa.cli import FUNCTIONS, main
 from vusfa.cli.functions import make_app
 from vusfa.errors import ConfigError
 
@@ -59,8 +59,18 @@ def test_faults_in_one_line() -> None:
 
 
 @pytest.mark.parametrize("name", FUNCTIONS)
-def test_all_have_help(name: str) -> None:
-    line = [sys.executable, "-m", "vusfa.cli", name, "--help"]
+def test_all_have_help(
+    name: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("vusfa.cli.signal.signal", lambda *_: None)  # SIGTERM stays pytest's
+    with pytest.raises(SystemExit) as ended:
+        main([name, "--help"])
+    assert not ended.value.code
+    assert f"Usage: vusfa {name}" in capsys.readouterr().out
+
+
+def test_help_of_a_process() -> None:
+    line = [sys.executable, "-m", "vusfa.cli", "table1", "--help"]
     done = subprocess.run(line, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
-    assert f"Usage: vusfa {name}" in done.stdout
+    assert "Usage: vusfa table1" in done.stdout

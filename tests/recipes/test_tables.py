@@ -35,7 +35,7 @@ def test_all_tables(recipe: Callable[[str], Any], tmp_path: Path, capsys: pytest
         "Unseen goals, the likeliest action",
         "All goals, computed, actions drawn",
         "Interquartile mean over seeds and scenes, actions drawn",
-        "Paired differences and chances of improvement, both in %, actions drawn",
+        "Paired differences and probabilities of improvement, both in %, actions drawn",
     ):
         assert f"### {title}\n" in out
     assert "soft-SPL" in out
