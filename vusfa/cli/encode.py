@@ -82,11 +82,11 @@ def encode(
         vusfa scenes encode room.h5 room_ten.h5 --crops ten --batch 8
     """
     from vusfa.cli.resumed import resumed
+    from vusfa.envs.scene_env import usable_device
     from vusfa.sources.backbones import load_backbone
     from vusfa.sources.encode import encode_scene
-    from vusfa.training import torch_device
 
-    torch_device(device)  # before the pictures are read
+    usable_device(device)  # before the pictures are read
     options = network_options(crops=crops, size=size, resize=resize, mean=mean, std=std)
     network = load_backbone(backbone, weights=weights, layer=layer, device=device, **options)
     with resumed("encoding", "pictures") as report:

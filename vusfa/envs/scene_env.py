@@ -22,7 +22,10 @@ __all__ = ["SceneEnv", "usable_device"]
 
 
 def usable_device(device: torch.device | str) -> torch.device:
-    """The device of a name; a ConfigError where it cannot be used here.
+    """A device by name.
+
+    Raises:
+        ConfigError: there is none of that name, or not in this machine.
 
     >>> usable_device("cpu")
     device(type='cpu')
@@ -31,8 +34,10 @@ def usable_device(device: torch.device | str) -> torch.device:
         found = torch.device(device)
         torch.empty(0, device=found)
     except (RuntimeError, AssertionError, NotImplementedError) as error:
-        first = str(error).split("\n", 1)[0]
-        raise ConfigError(f"device is {str(device)!r}: {first}; give 'cpu', or one that is there") from error
+        first = str(error).splitlines()[0]
+        raise ConfigError(
+            f"device is {str(device)!r}, which cannot be used here ({first}); give cpu or cuda"
+        ) from error
     return found
 
 

@@ -22,7 +22,7 @@ from vusfa.training.optimization import descend, make_optimizer, total_loss
 from vusfa.training.progress import EvaluationProgress, ProgressLine
 from vusfa.training.run import run_training
 from vusfa.training.scene_files import scene_sources
-from vusfa.training.setup import make_observation, make_trainer, row_name, set_threads, torch_device
+from vusfa.training.setup import make_observation, make_trainer, row_name, set_threads
 from vusfa.training.signals import StopOnSignal
 from vusfa.training.trainer import Trainer
 
@@ -53,7 +53,6 @@ __all__ = [
     "save_checkpoint",
     "scene_sources",
     "set_threads",
-    "torch_device",
     "total_loss",
 ]
 
@@ -68,5 +67,6 @@ __getattr__ = moved_names(
         "make_training": "vusfa.training.setup.make_trainer",
         "Session": "vusfa.training.trainer.Trainer",
         "Training": "vusfa.training.trainer.Trainer",
+        "torch_device": "vusfa.envs.scene_env.usable_device",
     },
 )

@@ -12,6 +12,7 @@ from torchrl.collectors import BaseCollector
 
 from vusfa.algorithms import make_algorithm, threads_per_step
 from vusfa.envs import SceneObservation, resolve_goals
+from vusfa.envs.scene_env import usable_device
 from vusfa.errors import ConfigError
 from vusfa.modules import Agent, make_agent
 from vusfa.scenes import SceneSet
@@ -24,7 +25,7 @@ from vusfa.training.precision import resolve_autocast
 from vusfa.training.trainer import Trainer
 from vusfa.training.upgrade import upgrade_config
 
-__all__ = ["decide_autocast", "make_observation", "make_trainer", "row_name", "set_threads", "torch_device"]
+__all__ = ["decide_autocast", "make_observation", "make_trainer", "row_name", "set_threads"]
 
 
 def make_trainer(
@@ -41,7 +42,7 @@ def make_trainer(
         VusfaError: settings that make no sense, in words.
     """
     torch.manual_seed(settings["seed"])
-    device, optim = torch_device(settings["device"]), settings["optim"]
+    device, optim = usable_device(settings["device"]), settings["optim"]
     if not isinstance(settings["autocast"], bool):
         settings = {**settings, "autocast": decide_autocast(settings)}
     scenes = SceneSet.open(settings["scenes"]) if scenes is None else scenes
@@ -106,7 +107,7 @@ def decide_autocast(settings: Mapping[str, Any]) -> bool:
     setting = settings["autocast"]
     if setting == "auto" and settings["resume"]:
         setting = load_checkpoint(settings["resume"])["config"]["autocast"]
-    return resolve_autocast(setting, torch_device(settings["device"]))
+    return resolve_autocast(setting, usable_device(settings["device"]))
 
 
 def make_observation(agent: Agent, scenes: SceneSet, crop: str = "first") -> SceneObservation | None:
@@ -170,23 +171,3 @@ def set_threads(threads: int) -> None:
         raise ConfigError(f"threads is {threads}; give 1 or more")
     torch.set_num_threads(threads)
     keep_memory()
-
-
-def torch_device(name: str) -> torch.device:
-    """A device by name.
-
-    Raises:
-        ConfigError: there is none of that name, or not in this machine.
-
-    >>> torch_device("cpu")
-    device(type='cpu')
-    """
-    try:
-        device = torch.device(name)
-        torch.empty(0, device=device)
-    except (RuntimeError, AssertionError, NotImplementedError) as error:
-        first = str(error).splitlines()[0]
-        raise ConfigError(
-            f"device is {name!r}, which cannot be used here ({first}); give cpu or cuda"
-        ) from error
-    return device
