@@ -18,9 +18,10 @@ from vusfa.evaluation import Episodes
 from vusfa.experiments.runs import Run, write_run
 from vusfa.report import Options, read_run, read_source, write_report
 from vusfa.report.command import report_runs
-from vusfa.report.content import gather, open_scenes
+from vusfa.report.content import gather
 from vusfa.report.experiment import read_experiment
 from vusfa.report.grouping import separate_runs
+from vusfa.report.run_scenes import open_scenes
 from vusfa.report.runs import LoggedRun
 from vusfa.scenes import Scene, SceneSet
 from vusfa.training import load_agent

@@ -12,9 +12,10 @@ import torch
 
 from vusfa.errors import ConfigError
 from vusfa.report import Options, write_report
-from vusfa.report.content import gather, goal_limit, open_scenes
+from vusfa.report.content import gather, goal_limit
 from vusfa.report.packing import unpack
 from vusfa.report.page import as_json
+from vusfa.report.run_scenes import open_scenes
 from vusfa.report.runs import LoggedRun
 from vusfa.scenes import Scene
 

@@ -6,8 +6,9 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from vusfa.errors import ConfigError
-from vusfa.report.content import Options, Row, add_pictures, gather, open_scenes
+from vusfa.report.content import Options, Row, add_pictures, gather
 from vusfa.report.page import page_weight, write_page, write_tables
+from vusfa.report.run_scenes import open_scenes
 from vusfa.report.runs import LoggedRun
 
 __all__ = ["write_report"]
@@ -31,7 +32,8 @@ def write_report(
         VusfaError: a scene or a checkpoint cannot be read.
     """
     options, out = options or Options(), Path(out)
-    content, tables = gather(runs, options)
+    scenes = open_scenes(runs, options.scenes)
+    content, tables = gather(runs, options, scenes)
     weight, most = page_weight(content), options.megabytes * 1e6
     if weight > most:
         raise ConfigError(
@@ -43,6 +45,6 @@ def write_report(
     states = sum(scene["states"] for scene in content["scenes"].values())
     room = max(0, int(most - weight) - 16 * states - 1000)
     shown = content["agents"] or content["maps"]  # nothing else shows pictures
-    add_pictures(content, open_scenes(runs, options.scenes), room if shown else 0)
+    add_pictures(content, scenes, room if shown else 0)
     page = write_page(out, content)
     return [page, *write_tables(out.with_name(f"{out.stem}_tables"), tables)], tables

@@ -5,7 +5,6 @@ from __future__ import annotations
 import platform
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import lru_cache
 from typing import Any
 
 import torch
@@ -13,7 +12,7 @@ import torch
 import vusfa
 from vusfa.envs.dynamics import MAX_STEPS
 from vusfa.errors import ConfigError
-from vusfa.evaluation import Episodes, get_metric, random_walk
+from vusfa.evaluation import get_metric, random_walk
 from vusfa.evaluation.baselines import RANDOM_WALK
 from vusfa.evaluation.summary import metric_columns
 from vusfa.report.by_goal import distance_rows, goal_rows
@@ -23,13 +22,13 @@ from vusfa.report.geometry import dart_path, floor_plan
 from vusfa.report.grouping import separate_runs
 from vusfa.report.packing import pack
 from vusfa.report.pictures import thumbnails
+from vusfa.report.run_scenes import open_scenes
 from vusfa.report.runs import LoggedRun
 from vusfa.report.tables import reference_rows, run_rows, seed_rows, summary_rows
 from vusfa.scenes import Scene, SceneSet
-from vusfa.training import load_agent
-from vusfa.training.checkpoint import check_scenes, load_checkpoint
+from vusfa.training.checkpoint import load_checkpoint, saved_agent
 
-__all__ = ["Options", "add_pictures", "gather", "goal_limit", "open_scenes", "tables"]
+__all__ = ["Options", "add_pictures", "gather", "goal_limit", "tables"]
 
 Row = dict[str, Any]
 
@@ -50,7 +49,8 @@ class Options:
         max_steps: limit of actions of these episodes.
         megabytes: size limit of the page.
         command: that makes the page again.
-        scenes: the runs' scenes, if they have moved, see :func:`open_scenes`.
+        scenes: the runs' scenes, if they have moved, see
+            :func:`~vusfa.report.run_scenes.open_scenes`.
         tell: called with a line of progress.
     """
 
@@ -66,86 +66,12 @@ class Options:
     tell: Callable[[str], None] = field(default=lambda line: None)
 
 
-def open_scenes(runs: Sequence[LoggedRun], given: SceneSet | None = None) -> dict[str, Scene]:
-    """The scenes of all runs by name, checked against their trainings.
-
-    Args:
-        runs: of the report.
-        given: the runs' scenes; opened from their checkpoints and settings by default.
-
-    Raises:
-        ConfigError: two runs have different scenes of one name, or a run has episodes of another scene.
-        CheckpointError: a scene differs from that of the training.
-        SceneError: a scene cannot be found.
-    """
-    found: dict[str, tuple[Scene, LoggedRun]] = {}
-    opened = lru_cache(SceneSet.open)
-    for run in runs:
-        world = _world(run, given, lambda sources: opened(tuple(sources)))
-        for scene in world.scenes if world else ():
-            known, first = found.setdefault(scene.name, (scene, run))
-            if known is not scene and not _equal(known, scene):
-                raise ConfigError(
-                    f"{first.folder} and {run.folder} have different scenes called {scene.name!r};"
-                    " report them apart, or rename one (attribute 'scene')"
-                )
-        _check_episodes(run, world)
-    return {name: scene for name, (scene, _) in found.items()}
-
-
-def _world(
-    run: LoggedRun, given: SceneSet | None, opened: Callable[[Sequence[str]], SceneSet]
-) -> SceneSet | None:
-    saved: dict[str, Any] = {"sources": run.scenes, "fingerprint": run.fingerprint}
-    if run.checkpoint is not None:
-        saved = load_checkpoint(run.checkpoint)["scenes"]
-    if given is not None:
-        every = given.names if run.episodes is None else run.episodes.scene_names
-        names = saved.get("names", every)
-        missing = [name for name in names if name not in given.names]
-        if missing:
-            raise ConfigError(f"scenes: {run.folder} is of {missing[0]!r}, which is not among them; add it")
-        world = SceneSet([given.scenes[given.scene_index(name)] for name in names])
-    elif saved["sources"]:
-        world = opened(saved["sources"])
-    else:
-        return None
-    if saved["fingerprint"]:
-        check_scenes(run.folder, {"names": list(world.names), **saved}, world)
-    return world
-
-
-def _walked_in(part: Episodes, scene: Scene) -> bool:
-    ids = torch.stack([part.start, part.goal])
-    if int(ids.min()) < 0 or int(ids.max()) >= scene.num_states:
-        return False
-    return bool((scene.distance[part.start, part.goal] == part.shortest).all())
-
-
-def _equal(one: Scene, other: Scene) -> bool:
-    return torch.equal(one.graph, other.graph) and torch.equal(one.features, other.features)
-
-
-def _check_episodes(run: LoggedRun, world: SceneSet | None) -> None:
-    """Refuse episodes of other scenes than the run's: their shortest paths tell."""
-    if run.episodes is None or world is None:
-        return
-    for index, name in enumerate(run.episodes.scene_names):
-        part = run.episodes.select(run.episodes.scene == index)
-        scene = world.scenes[world.names.index(name)] if name in world.names else None
-        if scene is None or not _walked_in(part, scene):
-            raise ConfigError(
-                f"{run.folder}: its episodes in {name!r} are of another scene than the run's"
-                f" ({', '.join(world.names)}); evaluate the run again with vusfa evaluate"
-            )
-
-
 def tables(runs: Sequence[LoggedRun], scenes: Mapping[str, Scene], options: Options) -> dict[str, list[Row]]:
     """The report's tables by name: summary, seeds, distance, goals, runs.
 
     Args:
         runs: of the report.
-        scenes: of :func:`open_scenes`.
+        scenes: of :func:`~vusfa.report.run_scenes.open_scenes`.
         options: for ``within``.
     """
     world = SceneSet(scenes.values())
@@ -174,13 +100,14 @@ def goal_limit(states: Sequence[int], agents: int, options: Options) -> int:
 
 
 def gather(
-    runs: Sequence[LoggedRun], options: Options | None = None
+    runs: Sequence[LoggedRun], options: Options | None = None, scenes: Mapping[str, Scene] | None = None
 ) -> tuple[dict[str, Any], dict[str, list[Row]]]:
     """The page's content without pictures (see :func:`add_pictures`).
 
     Args:
         runs: of the report, at least one.
         options: see :class:`Options`.
+        scenes: of :func:`~vusfa.report.run_scenes.open_scenes`; opened when not given.
 
     Returns:
         the content, plain data, and its tables.
@@ -192,7 +119,7 @@ def gather(
     options = options or Options()
     if not runs:
         raise ConfigError("a report needs at least one run; give the folders of runs of vusfa train")
-    scenes = open_scenes(runs, options.scenes)
+    scenes = open_scenes(runs, options.scenes) if scenes is None else scenes
     runs, notes = separate_runs(runs)
     for line in [*notes, "tables"]:
         options.tell(line)
@@ -232,7 +159,7 @@ def gather(
     }
     for run in shown:
         options.tell(f"explorer: {run.name}")
-        content["agents"].append(_explored(run, goals, options))
+        content["agents"].append(_explored(run, scenes, goals, options))
     return content, rows
 
 
@@ -256,7 +183,7 @@ def add_pictures(content: dict[str, Any], scenes: Mapping[str, Scene], budget: i
 
     Args:
         content: of :func:`gather`; changed in place.
-        scenes: of :func:`open_scenes`.
+        scenes: of :func:`~vusfa.report.run_scenes.open_scenes`.
         budget: bytes of base 64 of all pictures, divided by the scenes' numbers of states.
     """
     total = sum(scene.num_states for scene in scenes.values() if scene.has_pictures)
@@ -317,9 +244,13 @@ def _is_share(name: str) -> bool:
     return bool(metric_columns([{name: 0.0}])) and get_metric(name).unit == "%"
 
 
-def _explored(run: LoggedRun, goals: Mapping[str, Sequence[int]], options: Options) -> Row:
+def _explored(
+    run: LoggedRun, opened: Mapping[str, Scene], goals: Mapping[str, Sequence[int]], options: Options
+) -> Row:
     assert run.checkpoint is not None
-    agent, scenes, state = load_agent(run.checkpoint, _world(run, options.scenes, SceneSet.open))
+    state = load_checkpoint(run.checkpoint)
+    scenes = SceneSet([opened[name] for name in state["scenes"]["names"]])
+    agent = saved_agent(run.checkpoint, state, scenes)
     config, found = agent.config, {}
     for index, scene in enumerate(scenes.scenes):
         chosen = goals[scene.name]
