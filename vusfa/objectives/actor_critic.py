@@ -14,10 +14,10 @@ from torch.distributions import Distribution
 from torchrl.objectives.utils import ValueEstimators, dispatch_value_estimator, distance_loss
 
 from vusfa.modules.unique import gather
-from vusfa.objectives.common import NetworkLoss
 from vusfa.objectives.distribution import action_entropy, action_log_prob
 from vusfa.objectives.functional import explained_variance, policy_gradient_loss
 from vusfa.objectives.keys import LossKeys
+from vusfa.objectives.network_loss import NetworkLoss
 from vusfa.objectives.networks import (
     ends_in_distribution,
     entry,

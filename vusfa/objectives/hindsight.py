@@ -19,9 +19,9 @@ from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModuleBas
 from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor
 
-from vusfa.objectives.common import NetworkLoss
 from vusfa.objectives.distribution import action_log_prob
 from vusfa.objectives.functional import assert_same_shape
+from vusfa.objectives.network_loss import NetworkLoss
 from vusfa.objectives.networks import entry, run_actor_critic, run_critic, select_inputs
 
 __all__ = ["HindsightKeys", "HindsightLoss", "expectile_loss", "relabelled_target", "walked_return"]

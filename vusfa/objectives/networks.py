@@ -8,7 +8,6 @@ assumed about names or order.
 from __future__ import annotations
 
 import contextlib
-import reprlib
 from collections.abc import Iterator
 from typing import Any, TypeAlias, cast
 
@@ -23,6 +22,7 @@ from tensordict.utils import NestedKey
 from torch import Tensor, nn
 from torch.distributions import Distribution
 
+from vusfa.limits import brief
 from vusfa.modules.unique import gather, unique_rows
 
 __all__ = [
@@ -160,7 +160,7 @@ def entry(owner: object, tensordict: TensorDictBase, key: NestedKey, hint: str =
     """An entry; where it is missing, a ``KeyError`` names the owner's class, the entry, and ``hint``."""
     value = tensordict.get(key, None)
     if value is None:
-        names = reprlib.repr(sorted(str(name) for name in tensordict.keys()))
+        names = brief(sorted(str(name) for name in tensordict.keys()))
         raise KeyError(
             f"{type(owner).__name__}: the input has no {key!r}; it has {names}" + (hint and f"; {hint}")
         )

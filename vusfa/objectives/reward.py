@@ -11,8 +11,8 @@ from tensordict.nn import TensorDictModuleBase, TensorDictSequential, dispatch
 from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor
 
-from vusfa.objectives.common import NetworkLoss
 from vusfa.objectives.functional import assert_same_shape
+from vusfa.objectives.network_loss import NetworkLoss
 from vusfa.objectives.networks import entry
 from vusfa.objectives.rollout_values import check_next
 
