@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 import torch
 import torch.multiprocessing
+from omegaconf import DictConfig, OmegaConf
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 
@@ -155,6 +156,20 @@ def checkpoint_state() -> dict[str, Any]:
         "meter": {"episodes": {}, "terms": {}},
         "rng": {},
     }
+
+
+@pytest.fixture
+def settings() -> Callable[..., DictConfig]:
+    """Settings as the command line would make them, interpolations resolved."""
+    from vusfa.cli.launch import compose
+    from vusfa.conf import FOLDER
+
+    def made(*overrides: str, name: str = "train") -> DictConfig:
+        cfg = compose(FOLDER, name, overrides)
+        OmegaConf.resolve(cfg)
+        return cfg
+
+    return made
 
 
 @pytest.fixture

@@ -4,29 +4,16 @@ promise."""
 from __future__ import annotations
 
 import shlex
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import OmegaConf
 
 from vusfa.cli.launch import compose
 from vusfa.conf import FOLDER as CONF
 
 RECIPES = Path(__file__).parents[2] / "recipes"
 FILES = sorted(CONF.rglob("*.yaml"))
-
-
-@pytest.fixture
-def settings() -> Callable[..., DictConfig]:
-    """Settings as the command line would make them, interpolations resolved."""
-
-    def made(*overrides: str, name: str = "train") -> DictConfig:
-        cfg = compose(CONF, name, overrides)
-        OmegaConf.resolve(cfg)
-        return cfg
-
-    return made
 
 
 @pytest.mark.parametrize("path", FILES, ids=lambda path: str(path.relative_to(CONF)))

@@ -5,7 +5,6 @@ from __future__ import annotations
 import functools
 import inspect
 import pickle
-from collections.abc import Callable
 from typing import Any
 
 import pytest
@@ -24,12 +23,7 @@ from torchrl.envs.utils import check_env_specs, step_mdp
 
 from vusfa.envs import TargetNavEnv
 from vusfa.errors import ConfigError, GoalError
-from vusfa.scenes import Scene, SceneSet
-
-
-@pytest.fixture
-def scenes(make_scene: Callable[..., Scene]) -> SceneSet:
-    return SceneSet([make_scene("hall"), make_scene("attic", 3, 1)])  # 16 and 12 states
+from vusfa.scenes import SceneSet
 
 
 def random_walk(env: EnvBase, steps: int, seed: int = 0) -> Any:

@@ -24,13 +24,7 @@ from torchrl.envs.utils import check_env_specs, step_mdp
 
 from vusfa.envs import SceneObservation, TargetNavEnv
 from vusfa.errors import ConfigError, GoalError
-from vusfa.scenes import Scene, SceneSet
-
-
-@pytest.fixture
-def scenes(make_scene: Callable[..., Scene]) -> SceneSet:
-    return SceneSet([make_scene("hall"), make_scene("attic", 3, 1)])  # 16 and 12 states
-
+from vusfa.scenes import SceneSet
 
 #: How ``set_state`` reaches the environment: unspecified as 0.14 and as 0.15 take it, and as it is given.
 RULES: dict[str, dict[str, bool]] = {"0.14": {}, "0.15": {"set_state": False}, "given": {"set_state": True}}

@@ -9,10 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from omegaconf import DictConfig, OmegaConf
-
-from vusfa.cli.launch import compose
-from vusfa.conf import FOLDER as CONF
 
 RECIPES = Path(__file__).parents[2] / "recipes"
 
@@ -44,15 +40,3 @@ def small(scene_file: Path) -> list[str]:
         "checkpoint_every=1000000",
         "evaluation=none",
     ]
-
-
-@pytest.fixture
-def settings() -> Callable[..., DictConfig]:
-    """Settings as the command line would make them, interpolations resolved."""
-
-    def made(*overrides: str, name: str = "train") -> DictConfig:
-        cfg = compose(CONF, name, overrides)
-        OmegaConf.resolve(cfg)
-        return cfg
-
-    return made

@@ -64,7 +64,9 @@ def resume(trainer: Trainer, path: Path) -> None:
 
 
 def test_the_whole_one_is_taken(saved: tuple[Trainer, Path]):
-    resume(*saved)
+    trainer, path = saved
+    resume(trainer, path)
+    assert trainer.frames > load_checkpoint(path)["frames"]
 
 
 def test_every_flipped_bit_that_changes_content_is_seen(saved: tuple[Trainer, Path], tmp_path: Path):
