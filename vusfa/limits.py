@@ -72,6 +72,18 @@ FREE_BYTES = 1 << 28
 #: Size of one read of a zip file: of its list of contents, which is read at once.
 MAX_ZIP_READ = 1 << 22
 
+# ---- checkpoints
+
+#: Values and levels of nesting of a checkpoint's content.
+MAX_CHECKPOINT_VALUES, MAX_CHECKPOINT_DEPTH = 200_000, 32
+#: Size of a layer that a file may ask for beyond the sizes of its own weights.
+MAX_LAYER = 4096
+
+# ---- cameras
+
+#: Size of one picture of a stream.
+MAX_STREAM_PICTURE_BYTES = 1 << 25
+
 # ---- messages
 
 #: Faults that one message lists.

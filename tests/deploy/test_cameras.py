@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from vusfa import limits
 from vusfa.deploy import cameras
 from vusfa.deploy.cameras import open_camera
 from vusfa.errors import CameraError, SceneError
@@ -143,7 +144,7 @@ def test_cameras_that_are_not_there_or_send_no_pictures_are_one_line(
         next(open_camera(serve(stream([b"x"], "multipart/x-mixed-replace"))))
     with pytest.raises(SceneError, match=r"/video: is no picture that can be read"):
         next(open_camera(serve(stream([part(b"none", True)]))))
-    monkeypatch.setattr(cameras, "_MAX_BYTES", 1000)
+    monkeypatch.setattr(limits, "MAX_STREAM_PICTURE_BYTES", 1000)
     with pytest.raises(CameraError, match="a picture has more than 1000 bytes"):
         next(open_camera(serve(stream([b"--frame\r\n\r\n" + bytes(9000)]))))
     monkeypatch.setattr(cameras, "_TIMEOUT", 0.1)

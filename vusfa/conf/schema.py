@@ -6,7 +6,6 @@ Needs Hydra (extra ``recipes``).
 from __future__ import annotations
 
 import difflib
-import reprlib
 import types
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import fields, is_dataclass
@@ -20,6 +19,7 @@ from omegaconf.errors import ConfigKeyError, OmegaConfBaseException, ValidationE
 from vusfa.conf.compose import default_settings
 from vusfa.conf.settings import ALGORITHMS, LOSS_TERMS, POSITIVE, ObjectiveSettings, Settings, flat
 from vusfa.errors import ConfigError
+from vusfa.limits import brief
 
 __all__ = ["check_overrides", "mistake", "near", "register_schema", "schema", "validated"]
 
@@ -168,7 +168,7 @@ def _check_ranges(settings: Mapping[str, Any]) -> None:
             f"early_stopping.success is {share}; it is a share of episodes, at most 1: give 0.9"
         )
     if not 0 <= settings["seed"] < 2**32:
-        raise ConfigError(f"seed is {reprlib.repr(settings['seed'])}; it must be 0 to {2**32 - 1}")
+        raise ConfigError(f"seed is {brief(settings['seed'])}; it must be 0 to {2**32 - 1}")
 
 
 def _type_of(name: str) -> tuple[Any, bool]:

@@ -17,6 +17,7 @@ from urllib.request import OpenerDirector, ProxyHandler, build_opener
 
 import numpy as np
 
+from vusfa import limits
 from vusfa.deploy.pictures import decode_upright
 from vusfa.errors import CameraError
 from vusfa.limits import brief
@@ -25,8 +26,6 @@ __all__ = ["open_camera"]
 
 _ENDINGS = (".jpg", ".jpeg", ".png")
 _TIMEOUT = 10.0  # seconds
-#: Bytes of one picture of a stream.
-_MAX_BYTES = 1 << 25
 
 
 def open_camera(source: str) -> Iterator[np.ndarray]:
@@ -147,13 +146,18 @@ def _of_stream(response: Any, address: str) -> Generator[np.ndarray, None, None]
             yield decode_upright(part, address)
 
 
+def _check_size(content: bytes, address: str) -> None:
+    most = limits.MAX_STREAM_PICTURE_BYTES
+    if len(content) > most:
+        raise CameraError(f"camera {address}: a picture has more than {most} bytes; make them smaller")
+
+
 def _read(response: Any, address: str) -> bytes:
     try:
-        content = response.read(_MAX_BYTES + 1)
+        content = response.read(limits.MAX_STREAM_PICTURE_BYTES + 1)
     except (OSError, HTTPException) as error:
         raise CameraError(f"camera {address}: broke off ({error}); start again") from error
-    if len(content) > _MAX_BYTES:
-        raise CameraError(f"camera {address}: a picture has more than {_MAX_BYTES} bytes; make them smaller")
+    _check_size(content, address)
     return content
 
 
@@ -180,10 +184,7 @@ def _parts(response: Any, address: str) -> Generator[bytes, None, None]:
                     yield body
             if not chunk:
                 return
-            if len(buffer) > _MAX_BYTES:
-                raise CameraError(
-                    f"camera {address}: a picture has more than {_MAX_BYTES} bytes; make them smaller"
-                )
+            _check_size(buffer, address)
 
 
 def _first_part(buffer: bytes, mark: bytes, ended: bool) -> tuple[bytes, bytes] | None:

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from vusfa import limits
 from vusfa.errors import SceneError
-from vusfa.scenes.pictures import open_image
+from vusfa.scenes.pictures import check_scans, open_image
 
 __all__ = ["MIN_PICTURE_SIDE", "as_picture", "decode_upright", "in_shape"]
 
@@ -41,8 +41,7 @@ def decode_upright(encoded: bytes, name: str) -> np.ndarray:
         file
     """
     try:
-        if encoded.count(b"\xff\xda") > limits.MAX_PICTURE_SCANS:
-            raise OSError(f"more than {limits.MAX_PICTURE_SCANS} scans")
+        check_scans(encoded)
         with open_image(io.BytesIO(encoded)) as image:
             if max(image.size) > limits.MAX_PICTURE_SIDE:  # JPEG: decoded at half the size, or a quarter
                 image.draft("RGB", (limits.MAX_PICTURE_SIDE // 2,) * 2)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import reprlib
 from collections.abc import Sequence
 from os import PathLike
 from typing import Any
@@ -18,6 +17,7 @@ from torch import Tensor
 from vusfa.envs.navigation import TargetNavEnv
 from vusfa.envs.starts import DRAW_LIMIT
 from vusfa.errors import ConfigError
+from vusfa.limits import brief
 from vusfa.scenes import SceneSet
 
 __all__ = ["Observation", "Rows", "Scenes", "TellsLimit", "observation_space"]
@@ -47,9 +47,7 @@ class Rows(TargetNavEnv):
         """New episodes in the rows of the mask: at the ``state`` towards the ``goal`` chosen, or drawn."""
         self.drawing = mask
         if chosen and set(chosen) != {"state", "goal"}:
-            raise ConfigError(
-                f"reset options are {reprlib.repr([*chosen])}; give 'state' and 'goal', or neither"
-            )
+            raise ConfigError(f"reset options are {brief([*chosen])}; give 'state' and 'goal', or neither")
         fresh = self.set_state(**chosen) if chosen else self.reset()
         self.data = fresh if mask.all() else torch.where(torch.from_numpy(mask), fresh, self.data)
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import inspect
-import reprlib
 from collections.abc import Callable, Sequence
 from typing import Any, ClassVar
 
@@ -15,6 +14,7 @@ from torch import Tensor
 from vusfa.envs.rendering import draw_panels
 from vusfa.envs.world import World, env_specs, map_tensors
 from vusfa.errors import ConfigError
+from vusfa.limits import brief
 from vusfa.scenes import SceneSet
 from vusfa.torchrl_private import StatelessEnv
 
@@ -63,14 +63,14 @@ class SceneEnv(StatelessEnv):
     def __init__(self, scenes: SceneSet, batch_size: Sequence[int], history: int, seed: int | None) -> None:
         if not isinstance(scenes, SceneSet):
             raise ConfigError(
-                f"scenes is {reprlib.repr(scenes)}; give a SceneSet, such as SceneSet.open(['bathroom'])"
+                f"scenes is {brief(scenes)}; give a SceneSet, such as SceneSet.open(['bathroom'])"
             )
         if isinstance(batch_size, int):
             raise ConfigError(f"batch_size is {batch_size}; give a list, [{batch_size}]")
         try:
             size = torch.Size(batch_size)
         except TypeError as error:
-            raise ConfigError(f"batch_size is {reprlib.repr(batch_size)}; give a list, [64]") from error
+            raise ConfigError(f"batch_size is {brief(batch_size)}; give a list, [64]") from error
         super().__init__(device=torch.device("cpu"), batch_size=size)
         self.scenes = scenes.to("cpu")
         self.history = history

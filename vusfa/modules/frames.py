@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import reprlib
 import warnings
 from typing import Any
 
@@ -11,6 +10,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from vusfa.errors import ConfigError
+from vusfa.limits import brief
 from vusfa.modules.precision import for_autocast
 
 __all__ = ["FeatureFrames", "PictureFrames", "shrink_pictures"]
@@ -166,7 +166,7 @@ def _deviation(table: Tensor) -> Tensor:
         )
     floor = deviation[~constant].median().mul(0.01).clamp(max=1e-3)
     if constant.any():
-        columns = reprlib.repr(constant.nonzero()[:, 0].tolist())
+        columns = brief(constant.nonzero()[:, 0].tolist())
         warnings.warn(
             f"{int(constant.sum())} of {len(constant)} features are the same in all states and say nothing:"
             f" columns {columns}",

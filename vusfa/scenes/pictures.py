@@ -23,6 +23,7 @@ from vusfa.errors import SceneError
 from vusfa.scenes.hdf5 import dataset_in, opened
 
 __all__ = [
+    "check_scans",
     "decode",
     "look",
     "open_image",
@@ -66,14 +67,19 @@ def open_image(source: str | os.PathLike[str] | IO[bytes]) -> Iterator[Image.Ima
         raise OSError(f"{type(error).__name__}: {error}") from error
 
 
+def check_scans(encoded: bytes) -> None:
+    """Raise an OSError for a JPEG file of so many scans that decoding it would take for ever."""
+    if encoded.count(b"\xff\xda") > limits.MAX_PICTURE_SCANS:
+        raise OSError(f"more than {limits.MAX_PICTURE_SCANS} scans")
+
+
 def decode(encoded: bytes, shape: tuple[int, ...] | None = None) -> np.ndarray:
     """Decode a JPEG or PNG file to (H, W, 3) uint8; ``shape`` is the one that it must have.
 
     Raises:
         OSError: it is no picture of these formats, damaged, larger than allowed, or of another shape.
     """
-    if encoded.count(b"\xff\xda") > limits.MAX_PICTURE_SCANS:
-        raise OSError(f"more than {limits.MAX_PICTURE_SCANS} scans")
+    check_scans(encoded)
     with open_image(io.BytesIO(encoded)) as image:
         size = (image.height, image.width)
         if max(size) > limits.MAX_PICTURE_SIDE:

@@ -29,7 +29,6 @@ from __future__ import annotations
 
 import copy
 import os
-import reprlib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -40,6 +39,7 @@ from torch import Tensor
 from vusfa.conf.settings import flat
 from vusfa.errors import CheckpointError, SceneError, VusfaError
 from vusfa.files import replacing
+from vusfa.limits import brief
 from vusfa.modules import Agent, make_agent
 from vusfa.scenes import SceneSet
 from vusfa.training.content import check_entries, check_like, mended, read_content
@@ -118,7 +118,7 @@ def load_checkpoint(path: str | Path, device: torch.device | str = "cpu") -> dic
             raise mended(path, f"of version 0.1, but not as that wrote it ({error!r})") from error
     if state.get("format") != FORMAT:
         raise CheckpointError(
-            f"{path}: checkpoint of format {reprlib.repr(state.get('format'))}, this version reads 1 and"
+            f"{path}: checkpoint of format {brief(state.get('format'))}, this version reads 1 and"
             f" {FORMAT}; use the version that wrote it"
         )
     check_entries(path, state)
@@ -272,7 +272,7 @@ def load_optimizer(optimizer: torch.optim.Optimizer, state: Mapping[str, Any], p
             raise mended(path, f"its entry 'optimizer.param_groups.{index}.params' is of other parameters")
     for index, moments in saved["state"].items():  # a parameter without a gradient has none
         if index not in expected["state"]:
-            raise mended(path, f"its entry 'optimizer.state.{reprlib.repr(index)}' is of no parameter")
+            raise mended(path, f"its entry 'optimizer.state.{brief(index)}' is of no parameter")
         check_like(path, f"optimizer.state.{index}", moments, expected["state"][index])
     optimizer.load_state_dict(saved)
     for group, numbers in zip(optimizer.param_groups, settings, strict=True):

@@ -13,7 +13,6 @@ Rows get the same goals however they are spread over processes.
 
 from __future__ import annotations
 
-import reprlib
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from functools import partial
@@ -28,6 +27,7 @@ from torchrl.envs.transforms import Compose, Transform
 
 from vusfa.envs import TargetNavEnv
 from vusfa.errors import CheckpointError, ConfigError, WorkerError
+from vusfa.limits import brief
 from vusfa.scenes import SceneSet
 from vusfa.torchrl_private import carrier, end_weight_sharing, put_carrier
 from vusfa.training.content import check_like, mended, restore
@@ -241,7 +241,7 @@ def load_collector_state(
         raise mended(path, "its entry 'collector.carrier' is missing")
     if state.get("batch_size") != own["batch_size"]:
         raise CheckpointError(
-            f"the checkpoint holds {reprlib.repr(state.get('batch_size'))} environments, the collector"
+            f"the checkpoint holds {brief(state.get('batch_size'))} environments, the collector"
             f" {own['batch_size']}; leave collector.num_envs as it was"
         )
     known = own["carrier"]  # a collector that has not begun has no action there yet

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import math
 import os
-import reprlib
 import zipfile
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -20,7 +19,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from vusfa import limits
 from vusfa.errors import CheckpointError, VusfaError
+from vusfa.limits import brief
+from vusfa.reading import BoundedZip
 
 __all__ = ["ENTRIES", "check_entries", "check_like", "check_sizes", "mended", "read_content", "restore"]
 
@@ -56,8 +58,6 @@ _CONFIG: dict[str, type | tuple[type, ...]] = {
 #: Entries whose tensors hold numbers (a meter's may be NaN, the mean over nothing), and entries without any.
 _FINITE = ("agent", "algorithm", "optimizer", "collector")
 _PLAIN = ("agent_config", "scenes", "config", "overrides")
-#: Limits of a file, and of a layer that a file may ask for beyond the sizes of its own weights.
-MAX_VALUES, MAX_DEPTH, MAX_LAYER = 200_000, 32, 4096
 
 
 def mended(path: str | Path, what: str) -> CheckpointError:
@@ -94,29 +94,30 @@ def read_content(path: Path, device: torch.device | str) -> Any:
 
 def _damaged_record(path: Path, size: int) -> str | None:
     """What is wrong with an archive's records."""
-    with zipfile.ZipFile(path) as archive:
+    with BoundedZip(path) as archive:
         records = archive.infolist()
         if len({record.filename for record in records}) < len(records):
             return "two of its records have one name"
         for record in records:
             if record.compress_type != zipfile.ZIP_STORED:
-                return f"its record {reprlib.repr(record.filename)} is compressed"
+                return f"its record {brief(record.filename)} is compressed"
         if sum(record.file_size for record in records) > size:
             return "its records are longer than the file"
         name = archive.testzip()  # reads everything, and compares CRCs
-        return None if name is None else f"its record {reprlib.repr(name)} is not as it was written (CRC)"
+        return None if name is None else f"its record {brief(name)} is not as it was written (CRC)"
 
 
 class _Copy:
     """Copies content out of the mapped file, and refuses what no checkpoint holds."""
 
     def __init__(self, path: Path, device: torch.device) -> None:
-        self.path, self.device, self.left = path, device, MAX_VALUES
+        self.path, self.device, self.left = path, device, limits.MAX_CHECKPOINT_VALUES
 
     def copy(self, value: Any, where: str = "", depth: int = 0) -> Any:
         self.left -= 1
-        if self.left < 0 or depth > MAX_DEPTH:
-            raise mended(self.path, f"it holds more than {MAX_VALUES:,} values or {MAX_DEPTH} levels")
+        if self.left < 0 or depth > limits.MAX_CHECKPOINT_DEPTH:
+            most = f"{limits.MAX_CHECKPOINT_VALUES:,} values or {limits.MAX_CHECKPOINT_DEPTH} levels"
+            raise mended(self.path, f"it holds more than {most}")
         if isinstance(value, Tensor):
             return self._tensor(value, where)
         if isinstance(value, dict):
@@ -153,7 +154,7 @@ def check_entries(path: str | Path, state: Mapping[str, Any]) -> None:
     _check_types(path, "optimizer.", state["optimizer"], {"state": dict, "param_groups": list})
     for name in ("frames", "updates", "seconds"):
         if not 0 <= state[name] < math.inf:
-            raise mended(path, f"its entry {name!r} is {reprlib.repr(state[name])}, not 0 or more")
+            raise mended(path, f"its entry {name!r} is {brief(state[name])}, not 0 or more")
     for name in ("scenes.sources", "scenes.names", "overrides"):
         group, _, key = name.rpartition(".")
         if not all(isinstance(item, str) for item in (state[group] if group else state)[key]):
@@ -169,7 +170,7 @@ def check_entries(path: str | Path, state: Mapping[str, Any]) -> None:
 
 def check_sizes(path: str | Path, config: Mapping[str, Any], weights: Mapping[str, Tensor]) -> None:
     """Refuse with a CheckpointError a file of a few bytes that asks for layers of gigabytes."""
-    largest = max([MAX_LAYER, *(length for value in weights.values() for length in value.shape)])
+    largest = max([limits.MAX_LAYER, *(length for value in weights.values() for length in value.shape)])
     for name, value in config.items():
         for number in value if isinstance(value, list) else [value]:
             if isinstance(number, int) and name not in ("scenes", "fingerprint") and abs(number) > largest:
@@ -199,7 +200,7 @@ def check_like(path: str | Path, where: str, found: Any, expected: Any) -> None:
             if key not in found:
                 raise mended(path, f"its entry '{where}.{key}' is missing")
             if key not in expected:
-                raise mended(path, f"its entry '{where}.{reprlib.repr(key)[1:-1]}' is unknown")
+                raise mended(path, f"its entry '{where}.{brief(key)[1:-1]}' is unknown")
             check_like(path, f"{where}.{key}", found[key], expected[key])
     elif isinstance(expected, Tensor):
         same = isinstance(found, Tensor) and found.shape == expected.shape
@@ -228,7 +229,7 @@ def restore(path: str | Path, where: str, load: Callable[[Any], object], state: 
         AttributeError,
         OverflowError,
     ) as error:
-        raise mended(path, f"its entry {where!r} cannot be restored ({reprlib.repr(str(error))})") from error
+        raise mended(path, f"its entry {where!r} cannot be restored ({brief(str(error))})") from error
 
 
 def _check_types(path: str | Path, where: str, state: Mapping[str, Any], types: Mapping[str, Any]) -> None:
@@ -246,10 +247,10 @@ def _are_floats(*tensors: Tensor) -> bool:
 
 
 def _named(where: str) -> str:
-    return f"its entry {reprlib.repr(where[1:])}" if where else "it"
+    return f"its entry {brief(where[1:])}" if where else "it"
 
 
 def _shown(value: Any) -> str:
     if isinstance(value, Tensor):
         return f"{str(value.dtype).removeprefix('torch.')} {tuple(value.shape)}"
-    return reprlib.repr(value)
+    return brief(value)

@@ -69,8 +69,7 @@ class RunFolder:
 
     def __init__(self, path: str | Path | None, settings: Mapping[str, Any]) -> None:
         self._settings, self._unnamed = settings, path is None
-        self.path = default_folder(settings) if path is None else check_folder(path, "folder")
-        check_folder(self.path, "folder")
+        self.path = check_folder(default_folder(settings) if path is None else path, "folder")
         self._made: list[Path] = []
         self._lock: int | None = None
         if not self._unnamed:

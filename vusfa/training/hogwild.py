@@ -54,7 +54,7 @@ class HogwildTrainer(Trainer):
         self._make_env, chosen = make_env, settings["collector"]
         single = partial(_make_single, make_env, settings, 0)
         super().__init__(make_collector=single, settings=settings, **parts)
-        self.rows = rows_per_worker(chosen["kind"], chosen["num_envs"], chosen["num_workers"])
+        rows_per_worker(chosen["kind"], chosen["num_envs"], chosen["num_workers"])
         if settings["algorithm"]["name"] != "usf":
             raise ConfigError(
                 f"collector=hogwild trains with algorithm=usf, not {settings['algorithm']['name']}: a replay"
