@@ -237,6 +237,17 @@ def test_nothing_is_fetched_from_outside(opened: tuple[Any, list[str], list[str]
     complaints.clear()
 
 
+def fresh_tab(chromium: Any, page: Path) -> tuple[Any, list[str]]:
+    """A tab with the page, and all that it complains of."""
+    complaints: list[str] = []
+    tab = chromium.new_page()
+    tab.on("console", lambda message: complaints.append(message.text))
+    tab.on("pageerror", lambda error: complaints.append(str(error)))
+    tab.goto(page.as_uri())
+    tab.wait_for_selector("html[data-ready=yes]")
+    return tab, complaints
+
+
 @pytest.mark.parametrize("options", [["agent.history=2"], ["agent.memory=lstm"]])
 def test_an_agent_with_a_past(
     chromium: Any, train_run: Callable[..., Path], scene_file: Path, tmp_path: Path, options: list[str]
@@ -244,12 +255,7 @@ def test_an_agent_with_a_past(
     """Its next action does not follow from a pose alone: no walks are drawn in the page."""
     folder = train_run(tmp_path / "run", [f"scenes=[{scene_file}]", "env.goals=[3,9]", *options])
     write_report([read_run(folder)], tmp_path / "page.html", Options(goals_per_scene=4, max_steps=9))
-    complaints: list[str] = []
-    tab = chromium.new_page()
-    tab.on("console", lambda message: complaints.append(message.text))
-    tab.on("pageerror", lambda error: complaints.append(str(error)))
-    tab.goto((tmp_path / "page.html").as_uri())
-    tab.wait_for_selector("html[data-ready=yes]")
+    tab, complaints = fresh_tab(chromium, tmp_path / "page.html")
     assert len(colours(tab, "#x-map")) == 16
     assert tab.locator("#x-again").is_disabled()
     assert "at most 4 goals per scene." in tab.inner_text("#about")
@@ -268,12 +274,7 @@ def test_names_are_text_never_markup(chromium: Any, runs: list[LoggedRun], tmp_p
     """A model's name may hold anything; what a page's rule did not list by its hash would not run, either."""
     hostile = [dataclasses.replace(run, label=HOSTILE) for run in runs[:2]]
     write_report(hostile, tmp_path / "page.html", Options(goals_per_scene=2, walks=1, max_steps=9))
-    complaints: list[str] = []
-    tab = chromium.new_page()
-    tab.on("console", lambda message: complaints.append(message.text))
-    tab.on("pageerror", lambda error: complaints.append(str(error)))
-    tab.goto((tmp_path / "page.html").as_uri())
-    tab.wait_for_selector("html[data-ready=yes]")
+    tab, complaints = fresh_tab(chromium, tmp_path / "page.html")
     assert tab.inner_text("#summary tbody tr:first-child td:first-child") == HOSTILE
     label = tab.get_attribute("#map-grid svg", "aria-label")
     assert label is not None
