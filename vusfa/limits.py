@@ -13,8 +13,13 @@ __all__ = ["brief"]
 
 # ---- scenes (HDF5)
 
-#: States of a scene: its table of distances has the square of it. The largest known scene has 12,100.
-MAX_STATES = 16_384
+#: States of a scene. The largest known scene has 12,100.
+MAX_STATES = 100_000
+#: States up to which a scene's file has a table of all shortest paths; in a larger scene they are searched
+#: goal by goal when wanted. On request a table of at most so many states is made.
+TABLE_STATES, MAX_DISTANCE_STATES = 4096, 16_384
+#: Size of the shortest paths that a scene without a table keeps.
+MAX_PATH_BYTES = 1 << 26
 #: Size of a dataset over its size in the file. Tables of distances have about 10.
 MAX_COMPRESSION = 200
 #: The same for raw pictures, which are read some at a time: what gzip reaches with a single color.

@@ -7,7 +7,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from vusfa.envs.starts import DRAW_LIMIT, draw_goals, draw_starts, paths_from, start_table
+from vusfa.envs.starts import DRAW_LIMIT, draw_goals, draw_starts, path_table, paths_from, start_table
 from vusfa.errors import GoalError
 from vusfa.scenes import Scene, SceneSet
 
@@ -111,7 +111,9 @@ def test_paths_are_looked_up_in_the_scenes_own_table() -> None:
     table = start_table([s.graph for s in scenes.scenes], scenes.offsets, torch.tensor([1, 4]), scenes.names)
     state = torch.tensor([0, 2, 3, 4])
     goals = table.goals.take(torch.tensor([0, 1, 1, 1]))
-    assert paths_from(scenes.distance_tables[0], goals, state).tolist() == [1, 2, 1, 0]
+    paths = path_table(scenes, table.goals)
+    assert paths is not None
+    assert paths_from(paths, goals, state).tolist() == [1, 2, 1, 0]
 
 
 def test_two_hundred_thousand_states_take_memory_for_few_lists() -> None:

@@ -26,10 +26,10 @@ import torch
 from torch import Tensor
 
 from vusfa.errors import GoalError
-from vusfa.limits import brief
+from vusfa.limits import TABLE_STATES, brief
 from vusfa.reading import read_yaml
 from vusfa.scenes import Scene, SceneSet
-from vusfa.scenes.graph import strong_components
+from vusfa.scenes.graph import shortest_path_distances, strong_components
 
 __all__ = ["PAPER_MANIFEST", "GoalSpec", "read_manifest", "resolve_goals", "spread_goals"]
 
@@ -104,9 +104,10 @@ def read_manifest(path: str | PathLike[str]) -> dict[str, list[int]]:
 def spread_goals(scene: Scene, count: int) -> list[int]:
     """Goals spread over a scene: deterministic farthest-point selection on shortest paths.
 
-    The first is the farthest from all others on average; each further one has the farthest nearest chosen
-    goal. A distance is the mean of there and back, in actions; ties go to the lowest id. Goals are of the
-    largest strongly connected part of the scene, so that each can be reached from every other.
+    The first is the farthest from all others on average (of more than 4096 states, the farthest from the
+    first state); each further one has the farthest nearest chosen goal. A distance is the mean of there and
+    back, in actions; ties go to the lowest id. Goals are of the largest strongly connected part of the scene,
+    so that each can be reached from every other.
 
     Args:
         scene: the scene.
@@ -127,13 +128,21 @@ def spread_goals(scene: Scene, count: int) -> list[int]:
         raise GoalError(
             f"scene {scene.name!r}: {count} goals asked for; its largest part has {len(part)} states"
         )
-    there = scene.distance[part][:, part].to(torch.int64)
-    both = there + there.T
-    chosen = [int(both.sum(1).argmax())]
+
+    def there_and_back(one: int) -> Tensor:
+        there, state = scene.distances_to(part[one])[0], part[one : one + 1]
+        return (there + shortest_path_distances(scene.graph, state)[0].to(torch.int64))[part]
+
+    if len(part) <= TABLE_STATES:
+        there = scene.distance[part][:, part].to(torch.int64)
+        chosen = [int((there + there.T).sum(1).argmax())]
+    else:
+        chosen = [int(there_and_back(0).argmax())]
+    nearest = there_and_back(chosen[0])
     while len(chosen) < count:
-        nearest = both[chosen].amin(0)
         nearest[chosen] = -1
         chosen.append(int((nearest == nearest.max()).nonzero()[0]))
+        nearest = torch.minimum(nearest, there_and_back(chosen[-1]))
     return sorted(part[chosen].tolist())
 
 

@@ -182,7 +182,7 @@ class TargetNavEnv(SceneEnv):
             "elapsed_steps": self._zeros(torch.int64),
         }
         if "shortest_path" in self._keys:
-            entries["shortest_path"] = paths_from(self._world.distance, goals, start).unsqueeze(-1)
+            entries["shortest_path"] = self._path(start, goals)
         return entries
 
     def _begin(self) -> tuple[Tensor, GoalTable]:
@@ -193,6 +193,11 @@ class TargetNavEnv(SceneEnv):
         draw, scene_draw, goal_draw = self._draw(3)
         goals = draw_goals(world.starts, scene_draw, goal_draw)
         return draw_starts(world.starts.members, goals, draw), goals
+
+    def _path(self, start: Tensor, goals: GoalTable) -> Tensor:
+        if self._world.paths is not None:
+            return paths_from(self._world.paths, goals, start).unsqueeze(-1)
+        return self.scenes.distance(start.cpu(), goals.goal.cpu()).to(start.device).unsqueeze(-1)
 
     def _draw(self, *count: int) -> Tensor:
         shape = (*count, *self.batch_size)
@@ -215,8 +220,8 @@ class TargetNavEnv(SceneEnv):
             "collided": following.get("collided").masked_fill(done, False),
         }
         if "shortest_path" in self._keys:
-            path = paths_from(self._world.distance, goals, start)
-            entries["shortest_path"] = torch.where(done, path.unsqueeze(-1), following.get("shortest_path"))
+            before = following.get("shortest_path")
+            entries["shortest_path"] = torch.where(done, self._path(start, goals), before)
         for key in ("done", "terminated", "truncated"):
             entries[key] = torch.zeros_like(done)
         self._show(entries["state_id"], entries["goal_id"])

@@ -14,11 +14,23 @@ import torch
 from torch import Tensor
 
 from vusfa.errors import GoalError
+from vusfa.scenes import SceneSet
 from vusfa.scenes.graph import steps_to_goals, strong_components
 
-__all__ = ["DRAW_LIMIT", "GoalTable", "StartTable", "draw_goals", "draw_starts", "paths_from", "start_table"]
+__all__ = [
+    "DRAW_LIMIT",
+    "GoalTable",
+    "StartTable",
+    "draw_goals",
+    "draw_starts",
+    "path_table",
+    "paths_from",
+    "start_table",
+]
 
 DRAW_LIMIT = 2**62
+#: Shortest paths that are looked up in one table; of more, each is asked of the scenes when it is wanted.
+MAX_PATHS = 1 << 28
 
 
 class GoalTable(NamedTuple):
@@ -30,8 +42,8 @@ class GoalTable(NamedTuple):
         first: where the list of its starts begins in :attr:`StartTable.members`.
         starts: number of states an episode can begin at.
         rank: the goal's own position in its list, to be skipped.
-        stride, origin: the actions from state s to the goal stand at ``s * stride + origin`` in the scenes'
-            flat table of shortest paths (``SceneSet.distance_tables``).
+        origin: the actions from state s to the goal stand at ``s + origin`` of the goals' flat table of
+            shortest paths (:func:`path_table`).
     """
 
     goal: Tensor
@@ -39,7 +51,6 @@ class GoalTable(NamedTuple):
     first: Tensor
     starts: Tensor
     rank: Tensor
-    stride: Tensor
     origin: Tensor
 
     def take(self, slot: Tensor) -> GoalTable:
@@ -106,13 +117,10 @@ def start_table(graphs: Sequence[Tensor], offsets: Tensor, goals: Tensor, names:
             lists.append(reaching + offset)
             length += len(reaching)
     order = torch.argsort(scene, stable=True)
-    size = offsets.diff()
-    # (s - offset) * size + (goal - offset), from where the scene's table begins, sorted by what multiplies s
-    table = (size * size).cumsum(0) - size * size
-    origin = (table - offsets[:-1] * (size + 1))[scene] + goals
+    size = offsets.diff()[scene]
     _, scene_goals = scene.unique(return_counts=True)
     return StartTable(
-        goals=GoalTable(goals, scene, first, starts, rank, stride=size[scene], origin=origin),
+        goals=GoalTable(goals, scene, first, starts, rank, size.cumsum(0) - size - offsets[scene]),
         members=torch.cat(lists),
         order=order,
         scene_first=scene_goals.cumsum(0) - scene_goals,
@@ -141,15 +149,28 @@ def draw_starts(members: Tensor, goals: GoalTable, draw: Tensor) -> Tensor:
     return members[goals.first + index]
 
 
+def path_table(scenes: SceneSet, goals: GoalTable) -> Tensor | None:
+    """Shortest paths to the goals (G,), from every state of each goal's scene, flat, goal after goal; None
+    where they are more than :data:`MAX_PATHS`."""
+    if int(scenes.offsets.diff()[goals.scene].sum()) > MAX_PATHS:
+        return None
+    parts: dict[int, Tensor] = {}
+    for index in goals.scene.unique().tolist():
+        slot = (goals.scene == index).nonzero()[:, 0]
+        columns = scenes.scenes[index].distances_to(goals.goal[slot] - scenes.offsets[index])
+        parts |= dict(zip(slot.tolist(), columns, strict=True))
+    return torch.cat([parts[slot] for slot in range(len(goals.goal))])
+
+
 def paths_from(distance: Tensor, goals: GoalTable, state: Tensor) -> Tensor:
     """Shortest paths (*B,) int64 from states to goals of the same scene in actions; -1: there is none.
 
     Args:
-        distance: the scenes' flat table, ``SceneSet.distance_tables[0]``.
+        distance: the goals' flat table, of :func:`path_table`.
         goals: the goal of each row, columns (*B,).
         state: (*B,) int64 global ids.
     """
-    return distance[torch.addcmul(goals.origin, state, goals.stride)].to(torch.int64)
+    return distance[goals.origin + state].to(torch.int64)
 
 
 def draw_goals(table: StartTable, scene_draw: Tensor, goal_draw: Tensor) -> GoalTable:

@@ -10,7 +10,7 @@ from torch import Tensor
 from torchrl.data import Bounded, Categorical, Composite, TensorSpec, Unbounded
 
 from vusfa.envs.dynamics import Rewards
-from vusfa.envs.starts import GoalTable, StartTable, start_table
+from vusfa.envs.starts import GoalTable, StartTable, path_table, start_table
 from vusfa.scenes import SceneSet
 
 __all__ = ["STATE", "Observed", "Specs", "World", "env_specs", "make_world", "map_tensors"]
@@ -28,7 +28,7 @@ class World(NamedTuple):
         rewards: reward of a step.
         starts: distribution of start states.
         rows: the goal of each row, columns (*B,); None when goals are drawn.
-        distance: shortest paths, flat, scene after scene (``SceneSet.distance_tables``).
+        paths: shortest paths to the goals, see :func:`~vusfa.envs.starts.path_table`.
     """
 
     successor: Tensor
@@ -36,7 +36,7 @@ class World(NamedTuple):
     rewards: Rewards
     starts: StartTable
     rows: GoalTable | None
-    distance: Tensor
+    paths: Tensor | None
 
 
 def make_world(scenes: SceneSet, goals: Tensor, rewards: Rewards, rows: Tensor | None) -> World:
@@ -60,7 +60,7 @@ def make_world(scenes: SceneSet, goals: Tensor, rewards: Rewards, rows: Tensor |
         rewards=rewards,
         starts=starts,
         rows=None if rows is None else starts.goals.take(rows % len(goals)),
-        distance=scenes.distance_tables[0],
+        paths=path_table(scenes, starts.goals),
     )
 
 

@@ -41,7 +41,7 @@ def random_walk(scene: Scene, goals: Tensor, steps: int, unreachable: Unreachabl
     success = random_walk_success(scene.graph, goals, steps)
     if unreachable == "skip":
         return success
-    reaching = (scene.distance[:, goals.cpu()] > 0).sum(0)
+    reaching = (scene.distances_to(goals) > 0).sum(1)
     return torch.nan_to_num(success) * reaching / (scene.num_states - 1)
 
 

@@ -138,7 +138,7 @@ def exact_goals(
     metrics = [metric for metric in metrics_within(within, max_steps) if metric.exact]
     rows = []
     for index, scene in enumerate(scenes.scenes):
-        longest = int(scene.distance.max())
+        longest = scene.longest_path
         weights = _outcomes(longest, max_steps)
         scores = torch.stack([_score(metric.parts(weights)) for metric in metrics])
         scores = scores.view(len(metrics), max_steps + 1, longest + 1)
@@ -178,13 +178,13 @@ def _distributions(
     k-th action and its shortest path has d; the mean shortest path (g,), NaN for a goal that no start
     reaches."""
     scene, first = scenes.scenes[index], int(scenes.offsets[index])
-    size, longest = scene.num_states, int(scene.distance.max())
+    size, longest = scene.num_states, scene.longest_path
     for block in goals.split(at_once or goals_at_once(size)) if len(goals) else ():
         count = len(block)
         state = torch.arange(size).repeat(count) + first
         goal = block.repeat_interleave(size) + first
         acts = probabilities(state, goal, torch.full_like(state, index)).view(count, size, -1)
-        shortest = scene.distance[:, block].T.to(torch.int64)
+        shortest = scene.distances_to(block).to(torch.int64)
         starts = shortest > 0
         # Starts of one goal that are equally far are summed: one sparse product per action.
         bins = torch.arange(count)[:, None] * (longest + 1) + shortest.clamp(min=0)

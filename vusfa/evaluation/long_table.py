@@ -267,7 +267,7 @@ def distance_to_trained(scenes: SceneSet, scene: Tensor, goal: Tensor, trained: 
         here = scene == index
         sources = goal[here & trained]
         if sources.numel():
-            table = room.distance[sources][:, goal[here]].to(torch.int64)
+            table = room.distances_to(goal[here])[:, sources].T.to(torch.int64)
             far = table.max() + 1
             nearest = torch.where(table < 0, far, table).amin(0)
             nearest_one[here] = torch.where(nearest == far, -1, nearest)

@@ -51,7 +51,7 @@ def episode_starts(
         scene = int(scenes.scene_id[goal])
         states = torch.arange(int(scenes.offsets[scene]), int(scenes.offsets[scene + 1]))
         if unreachable == "skip":
-            allowed = states[scenes.distance(states, torch.full_like(states, goal)).cpu() > 0]
+            allowed = states[scenes.scenes[scene].distances_to(goal - int(states[0]))[0] > 0]
         else:
             allowed = states[states != goal]
         if allowed.numel():

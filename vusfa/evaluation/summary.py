@@ -114,7 +114,7 @@ def count_pairs(scenes: Iterable[Scene], unreachable: Unreachable) -> str:
     >>> count_pairs(SceneSet.bundled(["bathroom"]).scenes, "skip")
     'Every goal can be reached from every start.'
     """
-    lost = {scene.name: int((scene.distance < 0).sum()) for scene in scenes}
+    lost = {scene.name: sum(int((part < 0).sum()) for part in scene.all_distances()) for scene in scenes}
     lost = {name: count for name, count in lost.items() if count}
     if not lost:
         return "Every goal can be reached from every start."

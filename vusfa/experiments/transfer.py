@@ -75,9 +75,10 @@ def new_goals(
         here = trained.cpu()[(trained.cpu() >= first) & (trained.cpu() < first + scene.num_states)] - first
         if not len(here):
             continue
-        way = scene.distance[:, here].to(torch.int64)
+        way = scene.distances_to(here).T.to(torch.int64)
         nearest = torch.where(way < 0, torch.iinfo(torch.int64).max, way).amin(1)
-        reached = (scene.distance >= 0).all(0)  # from everywhere, so that every episode can succeed
+        # from everywhere, so that every episode can succeed
+        reached = torch.cat([(part >= 0).all(1) for part in scene.all_distances()])
         allowed = reached & (nearest == steps if steps is not None else nearest > 0)
         candidates = allowed.nonzero().squeeze(-1)
         if len(candidates) < per_scene:

@@ -162,7 +162,7 @@ def choose_goals(scene: Scene, trained: Sequence[int], success: Tensor | None, c
     for goal in spread_poses(scene.location, scene.rotation, scene.num_states):
         if len(chosen) >= count:
             break
-        if bool((scene.distance[:, goal] > 0).any()):
+        if bool((scene.distances_to(goal) > 0).any()):
             chosen.setdefault(goal)
     return list(chosen)
 
@@ -175,7 +175,7 @@ def choose_starts(scene: Scene, goal: int, count: int) -> list[int]:
     >>> room.distance[starts, 73].tolist() == sorted(room.distance[starts, 73].tolist(), reverse=True)
     True
     """
-    away = scene.distance[:, goal].to(torch.int64)
+    away = scene.distances_to(goal)[0].to(torch.int64)
     order = away.argsort(descending=True, stable=True)[: int((away > 0).sum())]
     if not order.numel():
         return []

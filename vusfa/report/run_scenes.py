@@ -70,7 +70,7 @@ def _walked_in(part: Episodes, scene: Scene) -> bool:
     ids = torch.stack([part.start, part.goal])
     if int(ids.min()) < 0 or int(ids.max()) >= scene.num_states:
         return False
-    return bool((scene.distance[part.start, part.goal] == part.shortest).all())
+    return bool((scene.path_lengths(part.start, part.goal) == part.shortest).all())
 
 
 def _equal(one: Scene, other: Scene) -> bool:

@@ -19,6 +19,7 @@ from vusfa.deprecated import moved_names
 from vusfa.errors import GoalError
 
 __all__ = [
+    "BackwardSearch",
     "as_states",
     "as_table",
     "default_actions",
@@ -147,6 +148,24 @@ def narrow_distances(distance: np.ndarray) -> Tensor:
     """
     fits = not distance.size or distance.max() <= np.iinfo(np.int16).max
     return torch.from_numpy(distance.astype(np.int16 if fits else np.int32, copy=False))
+
+
+class BackwardSearch:
+    """Lengths of the shortest paths from every state to one goal after the other, by breadth-first search.
+
+    Args:
+        graph: (N, A) integers, -1 = blocked.
+
+    >>> BackwardSearch(torch.tensor([[1, -1], [2, -1], [-1, -1]]))(2).tolist()
+    [2, 1, 0]
+    """
+
+    def __init__(self, graph: Tensor | np.ndarray) -> None:
+        self._backwards = _edges(as_table(graph)).T.tocsr()
+
+    def __call__(self, goal: int) -> np.ndarray:
+        """(N,) int16, or int32 where a path may be too long for it; -1 where there is none."""
+        return _breadth_first(self._backwards, np.array([goal]))[0]
 
 
 def steps_to_goals(graph: Tensor | np.ndarray, goals: Any) -> Tensor:

@@ -154,7 +154,7 @@ def read_distances(dataset: h5py.Dataset) -> np.ndarray:
     square = dataset.ndim == 2 and dataset.shape[0] == dataset.shape[1] > 0
     if not square or dataset.dtype.kind not in "iu" or dataset.dtype == np.int16:
         return np.asarray(dataset[()])
-    table = np.empty(dataset.shape, np.int16)  # of at most limits.MAX_STATES states
+    table = np.empty(dataset.shape, np.int16)  # of at most limits.TABLE_STATES states
     rows = dataset.chunks[0] if dataset.chunks else 1
     rows *= max(1, (1 << 22) // (rows * dataset.shape[1]))
     for first in range(0, len(table), rows):

@@ -7,7 +7,7 @@ blocked. No file stays open: a scene can be pickled, forked and spawned, and pic
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -18,15 +18,28 @@ import torch
 from torch import Tensor
 
 from vusfa.errors import SceneError
+from vusfa.limits import TABLE_STATES
 from vusfa.scenes import store
-from vusfa.scenes.graph import default_actions, narrow_distances, shortest_path_distances, weak_components
+from vusfa.scenes.graph import as_states, default_actions, weak_components
+from vusfa.scenes.paths import ShortestPaths
 from vusfa.scenes.pictures import read_pictures
 from vusfa.scenes.validation import array_faults, raise_faults
 
 __all__ = ["Scene"]
 
 
-@dataclass(frozen=True, eq=False)
+class _Distance:
+    """The field ``Scene.distance``: what was given until it is checked, then a table that is made when asked
+    for."""
+
+    def __get__(self, scene: Scene | None, owner: type) -> Any:
+        return None if scene is None else scene._paths.table
+
+    def __set__(self, scene: Scene, value: Any) -> None:
+        vars(scene)["_distance"] = value
+
+
+@dataclass(frozen=True, eq=False, repr=False)
 class Scene:
     """A room: its graph, its pictures' features, its poses. All tensors are on the CPU.
 
@@ -36,8 +49,9 @@ class Scene:
         features: (N, C, F) floats, C crops (augmented views) of F features; kept as float32.
         location: (N, 2) metres; zeros when not given.
         rotation: (N,) degrees; zeros when not given.
-        distance: (N, N) integers, ``[s, g]`` actions from s to g, -1 = unreachable; computed when not given,
-            else checked against the graph.
+        distance: (N, N) integers, ``[s, g]`` actions from s to g, -1 = unreachable; checked against the
+            graph. When not given, the table is made when it is asked for, of at most 16,384 states;
+            :meth:`distances_to` needs none.
         actions: A names; those of the THOR v1 dumps when not given and A is 4.
         attributes: provenance: str, int, float, or lists of these.
         path: the file that pictures are read from; None for a scene in memory.
@@ -57,14 +71,15 @@ class Scene:
 
     name: str
     graph: Tensor
-    features: Tensor = field(repr=False)
-    location: Tensor = field(default=None, repr=False)  # type: ignore[assignment]
-    rotation: Tensor = field(default=None, repr=False)  # type: ignore[assignment]
-    distance: Tensor = field(default=None, repr=False)  # type: ignore[assignment]
+    features: Tensor
+    location: Tensor = None  # type: ignore[assignment]
+    rotation: Tensor = None  # type: ignore[assignment]
+    distance: Tensor = _Distance()  # type: ignore[assignment]
     actions: tuple[str, ...] = None  # type: ignore[assignment]
-    attributes: dict[str, Any] = field(default_factory=dict, repr=False)
+    attributes: dict[str, Any] = field(default_factory=dict)
     path: Path | None = None
     picture_shape: tuple[int, int, int] | None = None
+    _paths: ShortestPaths = field(init=False)
 
     def __post_init__(self) -> None:
         given = {
@@ -72,7 +87,7 @@ class Scene:
             "resnet_feature": self.features,
             "location": self.location,
             "rotation": self.rotation,
-            "shortest_path_distance": self.distance,
+            "shortest_path_distance": vars(self).pop("_distance"),
         }
         arrays = {
             key: np.array(value.detach().cpu().numpy() if isinstance(value, Tensor) else value)
@@ -85,18 +100,17 @@ class Scene:
         actions = None if self.actions is None else tuple(self.actions)
         source = f"scene {self.name!r}" if self.path is None else self.path
         raise_faults(source, array_faults(arrays, actions, optional=["shortest_path_distance"]))
-        if "shortest_path_distance" not in arrays:
-            arrays["shortest_path_distance"] = shortest_path_distances(arrays["graph"]).numpy()
         self._set(arrays, actions)
 
     def _set(self, arrays: dict[str, np.ndarray], actions: tuple[str, ...] | None) -> None:
         """Set the fields from arrays that are sound, and are the scene's own from now on."""
+        graph = _tensor(arrays["graph"], np.int64)
         values = {
-            "graph": _tensor(arrays["graph"], np.int64),
+            "graph": graph,
             "features": _tensor(arrays["resnet_feature"], np.float32),
             "location": _tensor(arrays["location"], np.float32),
             "rotation": _tensor(arrays["rotation"], np.float32),
-            "distance": narrow_distances(arrays["shortest_path_distance"]),
+            "_paths": ShortestPaths(graph.numpy(), arrays.get("shortest_path_distance")),
             "actions": actions or default_actions(arrays["graph"].shape[1]),
             "attributes": dict(self.attributes),
             # Workers may run in another folder.
@@ -168,6 +182,7 @@ class Scene:
             SceneError: the pictures do not fit, an attribute cannot be written, or the folder does not exist.
         """
         in_file = self.path is not None and (self.has_pictures or self.path.is_file())
+        small = self.num_states <= TABLE_STATES
         store.write(
             path,
             {
@@ -175,7 +190,7 @@ class Scene:
                 "resnet_feature": self.features.numpy(),
                 "location": self.location.numpy(),
                 "rotation": self.rotation.numpy(),
-                "shortest_path_distance": self.distance.numpy(),
+                **({"shortest_path_distance": self.distance.numpy()} if small else {}),
             },
             name=self.name,
             actions=self.actions,
@@ -203,6 +218,41 @@ class Scene:
         states = torch.as_tensor(ids, dtype=torch.int64).cpu()
         found = torch.from_numpy(read_pictures(self.path, states.reshape(-1).numpy()))
         return found.reshape(*states.shape, *found.shape[1:])
+
+    def distances_to(self, goals: Any) -> Tensor:
+        """Lengths of the shortest paths from every state to some goals, searched when first asked for.
+
+        Args:
+            goals: one state id, or (G,).
+
+        Returns:
+            (G, N) int16, or int32 where a path is too long for it, in actions; -1: there is none.
+
+        Raises:
+            GoalError: a goal that is not a state.
+
+        >>> corridor = Scene("corridor", torch.tensor([[1, -1], [2, 0], [-1, 1]]), torch.rand(3, 1, 8))
+        >>> corridor.distances_to([2]).tolist()
+        [[2, 1, 0]]
+        """
+        return self._paths.to_goals(torch.from_numpy(as_states(goals, self.num_states, "goal")))
+
+    def all_distances(self) -> Iterator[Tensor]:
+        """:meth:`distances_to` all states, some (G, N) at a time."""
+        at_once = max(1, (1 << 22) // self.num_states)
+        return (self.distances_to(goals) for goals in torch.arange(self.num_states).split(at_once))
+
+    @cached_property
+    def longest_path(self) -> int:
+        """Length of the longest of all shortest paths, in actions."""
+        return max(int(distances.max()) for distances in self.all_distances())
+
+    def path_lengths(self, state: Tensor, goal: Tensor) -> Tensor:
+        """Lengths (n,) int64 of the shortest paths from states (n,) to goals (n,); -1: there is none."""
+        return self._paths.between(state, goal)
+
+    def __repr__(self) -> str:
+        return f"Scene({self.name!r}, {self.num_states} states, {self.num_actions} actions)"
 
     @property
     def has_pictures(self) -> bool:

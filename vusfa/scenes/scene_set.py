@@ -72,9 +72,6 @@ class SceneSet:
         self.location = _joined([scene.location.numpy() for scene in self.scenes])
         self.rotation = _joined([scene.rotation.numpy() for scene in self.scenes])
         self.scene_id = torch.from_numpy(np.repeat(np.arange(len(sizes)), sizes))
-        # One N x N table after the other, row by row; S x S would be mostly "another scene".
-        self._distance = _joined([scene.distance.numpy().ravel() for scene in self.scenes])
-        self._distance_start = torch.from_numpy(np.cumsum([0, *(size * size for size in sizes)]))
 
     @classmethod
     def bundled(cls, names: Sequence[str] | None = None) -> SceneSet:
@@ -147,12 +144,14 @@ class SceneSet:
 
     @property
     def distance_tables(self) -> tuple[Tensor, Tensor]:
-        """The scenes' tables (N, N) of shortest paths, flat, one after the other, for frequent use.
+        """The scenes' tables (N, N) of shortest paths, flat, one after the other; made anew at each call.
 
         Entry ``first[i] + s * N + g`` of the first tensor is the actions from s to g, in scene i's own ids;
-        the second tensor is ``first``, (n_scenes + 1,). Shared, not copied.
+        the second tensor is ``first``, (n_scenes + 1,). A single scene's is shared, not copied.
         """
-        return self._distance, self._distance_start
+        tables = [scene.distance.numpy().ravel() for scene in self.scenes]
+        first = torch.from_numpy(np.cumsum([0, *(len(table) for table in tables)]))
+        return _joined(tables).to(self.device), first.to(self.device)
 
     def distance(self, state: Any, goal: Any) -> Tensor:
         """Lengths of the shortest paths from states to goals, global ids of shapes that broadcast.
@@ -160,15 +159,17 @@ class SceneSet:
         Returns:
             int64 of the broadcast shape, in actions; -1 where the goal is unreachable or in another scene.
         """
-        state = torch.as_tensor(state, dtype=torch.int64, device=self.device)
-        goal = torch.as_tensor(goal, dtype=torch.int64, device=self.device)
-        scene = self.scene_id[state]
-        first, size = self.offsets[scene], self.offsets[scene + 1] - self.offsets[scene]
-        same = scene == self.scene_id[goal]
-        # Where the scenes differ the sum below could lie outside the table: look entry 0 up and drop it.
-        place = self._distance_start[scene] + (state - first) * size + (goal - first)
-        found = self._distance[torch.where(same, place, 0)].to(torch.int64)
-        return torch.where(same, found, -1)
+        state, goal = torch.broadcast_tensors(
+            *(torch.as_tensor(ids, dtype=torch.int64, device=self.device) for ids in (state, goal))
+        )
+        scene = torch.where(self.scene_id[state] == self.scene_id[goal], self.scene_id[state], -1).cpu()
+        found = torch.full_like(scene, -1)
+        for index in scene.unique().tolist():
+            if index >= 0:
+                rows, first = scene == index, int(self.offsets[index])
+                local = (ids.cpu()[rows] - first for ids in (state, goal))
+                found[rows] = self.scenes[index].path_lengths(*local)
+        return found.to(self.device)
 
     def scene_index(self, scene: str | int) -> int:
         """Index of a scene by its name, or its index checked.

@@ -5,7 +5,7 @@
 | graph (N, A) | next state, -1 = blocked; any integers |
 | resnet_feature (N, C, F) | features of each state's C crops, whatever network they come from; any floats |
 | location (N, 2), rotation (N,) | metres, degrees |
-| shortest_path_distance (N, N) | in actions, -1 = unreachable; any integers |
+| shortest_path_distance (N, N) | in actions, -1 = unreachable; any integers; not read of over 4096 states |
 | observation, or observation_jpeg | optional: the pictures, see :mod:`vusfa.scenes.pictures` |
 
 Attributes carry the provenance; of these, ``scene`` and ``actions`` are the scene's name and the names of its
@@ -25,7 +25,7 @@ import numpy as np
 
 from vusfa.deprecated import moved_names
 from vusfa.errors import SceneError
-from vusfa.limits import MAX_NAME, brief
+from vusfa.limits import MAX_NAME, TABLE_STATES, brief
 from vusfa.scenes import pictures as picture_files
 from vusfa.scenes.hdf5 import (
     check_heaps,
@@ -116,9 +116,16 @@ def read(path: str | os.PathLike[str]) -> Dump:
         for name in DATASETS:
             try:
                 dataset = dataset_in(file, name)
-                if dataset is not None:
-                    distances = name == "shortest_path_distance"
-                    dump.arrays[name] = read_distances(dataset) if distances else np.asarray(dataset[()])
+                if dataset is None:
+                    continue
+                if name != "shortest_path_distance":
+                    dump.arrays[name] = np.asarray(dataset[()])
+                elif dataset.shape[:1] <= (TABLE_STATES,):
+                    dump.arrays[name] = read_distances(dataset)
+                elif (
+                    dataset.shape != np.shape(dump.arrays.get("graph", ()))[:1] * 2
+                ):  # not read, but it must fit
+                    dump.arrays[name] = np.broadcast_to(np.zeros((), dataset.dtype), dataset.shape)
             except (OSError, RuntimeError, TypeError, ValueError) as error:
                 dump.reading_faults.append(
                     f"dataset {name!r} cannot be read ({error}); copy the file or make it again"
@@ -201,7 +208,8 @@ def write(
 
     Args:
         path: file to write; replaced if it exists.
-        arrays: the datasets of :data:`vusfa.scenes.validation.DATASETS`.
+        arrays: the datasets of :data:`vusfa.scenes.validation.DATASETS`; without the table of distances in
+            scenes of more than 4096 states.
         name: the scene's name.
         actions: A names.
         attributes: provenance.
@@ -215,7 +223,8 @@ def write(
     """
     path = Path(path)
     num_states = len(arrays["graph"])
-    packed = {key: _smallest_integer(arrays[key]) for key in ("graph", "shortest_path_distance")}
+    integers = ("graph", "shortest_path_distance")
+    packed = {key: _smallest_integer(arrays[key]) for key in integers if key in arrays}
     packed["resnet_feature"] = _smallest_float(arrays["resnet_feature"])
     packed |= {key: np.asarray(arrays[key], dtype=np.float32) for key in ("location", "rotation")}
     raw: Iterable[np.ndarray] | None = None
@@ -231,7 +240,7 @@ def write(
         raise SceneError(f"{path}: {len(pictures)} pictures for {num_states} states; give one for each")
     with replaced(path) as file:
         _write_attributes(file, {**attributes, "scene": name, "actions": list(actions)})
-        for key in DATASETS:
+        for key in (name for name in DATASETS if name in packed):
             file.create_dataset(
                 key, data=packed[key], compression="gzip", compression_opts=9, shuffle=True, fletcher32=True
             )

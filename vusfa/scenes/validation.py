@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from vusfa.errors import SceneError
-from vusfa.limits import MAX_FAULTS
+from vusfa.limits import MAX_FAULTS, TABLE_STATES
 from vusfa.scenes.graph import shortest_path_distances
 
 if TYPE_CHECKING:
@@ -216,7 +216,7 @@ def array_faults(
                 sound[name] = arrays[name]
             else:
                 faults.append(fault)
-        elif name not in optional:
+        elif name not in optional and not (name == "shortest_path_distance" and num_states > TABLE_STATES):
             faults.append(f"dataset {name!r} is missing; write it as {kinds_name} {shape}")
     if "graph" in sound:
         faults += graph_faults(sound["graph"], actions)

@@ -17,6 +17,7 @@ import torch
 from torch import Tensor
 
 from vusfa.errors import ConfigError, SceneError
+from vusfa.limits import TABLE_STATES
 from vusfa.scenes import store
 from vusfa.scenes.graph import default_actions, shortest_path_distances
 from vusfa.scenes.pictures import read_pictures
@@ -199,7 +200,7 @@ def encode_scene(
         progress=progress,
     )
     arrays = {**dump.arrays, "resnet_feature": features}
-    if "shortest_path_distance" not in arrays:
+    if "shortest_path_distance" not in arrays and num_states <= TABLE_STATES:
         arrays["shortest_path_distance"] = shortest_path_distances(arrays["graph"]).numpy()
     store.write(
         target,

@@ -72,7 +72,9 @@ def summarize(scene: Scene, walk_steps: int = 500) -> Summary:
     (176, 44, 0, 0.0, 21, 0.566)
     """
     walk = random_walk_success(scene.graph, torch.arange(scene.num_states), walk_steps)
-    paths = scene.distance[scene.distance > 0].double()
+    total = count = 0
+    for part in scene.all_distances():
+        total, count = total + int(part[part > 0].sum()), count + int((part > 0).sum())
     return Summary(
         name=scene.name,
         states=scene.num_states,
@@ -85,8 +87,8 @@ def summarize(scene: Scene, walk_steps: int = 500) -> Summary:
         picture_shape=scene.picture_shape,
         walk_steps=walk_steps,
         random_walk=float(walk.nanmean()),
-        mean_path=float(paths.mean()),
-        longest_path=int(paths.max()) if len(paths) else 0,
+        mean_path=total / count if count else math.nan,
+        longest_path=scene.longest_path,
     )
 
 
