@@ -168,7 +168,7 @@ def test_a_file_is_replaced_only_when_asked(run: Run, flat: Path, features: Path
     Path("flat.h5").write_bytes(b"precious")
     result = run("from-photos", flat, "--features", features)
     assert result.exit_code == 1
-    assert "flat.h5: exists; choose another name with -o, or replace it with --force" in result.stderr
+    assert "flat.h5: exists; choose another name, or replace it with --force" in result.stderr
     assert Path("flat.h5").read_bytes() == b"precious"
     assert run("from-photos", flat, "--features", features, "--force").exit_code == 0
     assert validate("flat.h5") == []

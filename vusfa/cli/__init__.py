@@ -10,10 +10,11 @@ from __future__ import annotations
 import signal
 import sys
 from collections.abc import Sequence
+from typing import NamedTuple
 
 from vusfa.cli.interrupts import quiet_interrupts
 
-__all__ = ["COMMANDS", "TRAINING_COMMANDS", "main"]
+__all__ = ["COMMANDS", "FIRST_STEPS", "FUNCTIONS", "TRAINING_COMMANDS", "Forwarded", "main"]
 quiet_interrupts()  # here: the modules of this package import what takes seconds
 
 #: Modules that add commands, in the order in which ``--help`` shows them. A new command is a module with a
@@ -29,36 +30,75 @@ COMMANDS = [
 ]
 
 #: Modules that add a command to ``vusfa`` itself, with a function ``register(app)``.
-TRAINING_COMMANDS = ["vusfa.cli.train", "vusfa.cli.deploy", "vusfa.cli.pretrained"]
+TRAINING_COMMANDS = ["vusfa.cli.train", "vusfa.cli.deploy", "vusfa.cli.film", "vusfa.cli.pretrained"]
 
 
-#: Commands beside ``vusfa scenes``: name, help, and the functions that they run.
-FUNCTIONS: dict[str, tuple[str, dict[str, str]]] = {
-    "evaluate": (
+class Forwarded(NamedTuple):
+    """A command that runs functions of other packages, imported when it runs.
+
+    Attributes:
+        words: its help in the list of commands.
+        functions: ``module.function`` by the subcommand's name; "" where there is one function.
+        examples: command lines, shown by its help.
+        panel: of the list of commands.
+    """
+
+    words: str
+    functions: dict[str, str]
+    examples: tuple[str, ...]
+    panel: str = "Experiments"
+
+
+#: Commands beside ``vusfa scenes`` and those of the modules above.
+FUNCTIONS: dict[str, Forwarded] = {
+    "evaluate": Forwarded(
         "Evaluate a checkpoint: every state of every scene a goal.",
         {"": "vusfa.experiments.zero_shot.zero_shot"},
+        ("vusfa evaluate runs/first", "vusfa evaluate runs/first/checkpoint.pt episodes=50 goals=random:5"),
+        panel="Agents",
     ),
-    "table1": (
-        "The paper's Table 1: train and evaluate, per model and seed.",
+    "report": Forwarded(
+        "Write one HTML page of runs and results.",
+        {"": "vusfa.report.command.report_runs"},
+        ("vusfa report runs/first", "vusfa report VUSFA=runs/first GVF=runs/second out=both.html"),
+        panel="Agents",
+    ),
+    "table1": Forwarded(
+        "Reproduce the paper's Table 1: train and evaluate, per model and seed.",
         {"": "vusfa.experiments.table1.table1"},
+        ("vusfa table1", "vusfa table1 preset=paper models=[gvf,vusfa] seeds=[0,1] experiment=paper"),
     ),
-    "tables": (
-        "All tables of results, with intervals; Markdown and CSV.",
+    "tables": Forwarded(
+        "Print the tables of results, with intervals, as Markdown and CSV.",
         {"": "vusfa.report.print_tables.print_tables"},
+        ("vusfa tables table1", "vusfa tables table1 hindsight results=results out=csv"),
     ),
-    "transfer": (
-        "The paper's Figure 2: run the fine-tuning towards new goals, show its figure.",
+    "transfer": Forwarded(
+        "Reproduce the paper's Figure 2: fine-tune towards new goals, show the figure.",
         {
             "run": "vusfa.experiments.run_transfer.run_transfer",
             "show": "vusfa.report.transfer_figure.show_transfer",
         },
+        ("vusfa transfer run models=[gvf,vusfa] seeds=[0]", "vusfa transfer show out=transfer.png"),
     ),
-    "generalise": (
+    "generalise": Forwarded(
         "Train in some rooms, test in others.",
         {"": "vusfa.experiments.generalise.generalise"},
+        ("vusfa generalise rooms/small", "vusfa generalise rooms/small total_frames=1000000 seed=1"),
     ),
-    "report": ("One HTML page of runs and results.", {"": "vusfa.report.command.report_runs"}),
 }
+
+#: What ``vusfa --help`` ends with.
+FIRST_STEPS = """
+First steps:
+
+    vusfa pretrained list
+    vusfa film vusfa --scene kitchen
+    vusfa train preset=hindsight scenes=[bathroom] total_frames=50000 evaluation=all folder=runs/first
+    vusfa report runs/first
+
+Settings and options are written name=value, options also --name value. Every --help has examples.
+"""
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

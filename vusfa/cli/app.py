@@ -9,8 +9,8 @@ import typer
 from typer.core import TyperGroup
 
 from vusfa import __version__
-from vusfa.cli import COMMANDS, FUNCTIONS, TRAINING_COMMANDS
-from vusfa.cli.functions import forward
+from vusfa.cli import COMMANDS, FIRST_STEPS, FUNCTIONS, TRAINING_COMMANDS
+from vusfa.cli.functions import App, forward
 from vusfa.errors import VusfaError
 
 __all__ = ["app", "scenes"]
@@ -31,17 +31,13 @@ class _Commands(TyperGroup):
             raise typer.Exit(130) from interrupt
 
 
-_LOOKS: dict[str, Any] = {
-    "no_args_is_help": True,
-    "rich_markup_mode": "markdown",
-    "context_settings": {"help_option_names": ["-h", "--help"]},
-}
-
 #: ``vusfa``
-app = typer.Typer(cls=_Commands, pretty_exceptions_enable=False, **_LOOKS)
+app = App(cls=_Commands, epilog=FIRST_STEPS)
 #: ``vusfa scenes``: the commands of :data:`vusfa.cli.COMMANDS` are registered here
-scenes = typer.Typer(**_LOOKS)
-app.add_typer(scenes, name="scenes", help="Scenes: look at them, check them, make your own.")
+scenes = App(epilog="Every command that reads a scene takes a bundled name or a file: bathroom, room.h5.")
+app.add_typer(
+    scenes, name="scenes", help="Look at scenes, check them, make your own.", rich_help_panel="Scenes"
+)
 
 
 def _show_version(requested: bool) -> None:
@@ -62,7 +58,7 @@ def _vusfa(
 
 for _name in TRAINING_COMMANDS:
     import_module(_name).register(app)
-for _name, (_words, _functions) in FUNCTIONS.items():
-    forward(app, _name, _words, _functions)
+for _name, _command in FUNCTIONS.items():
+    forward(app, _name, _command)
 for _name in COMMANDS:
     import_module(_name).register(scenes)

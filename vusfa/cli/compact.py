@@ -7,6 +7,8 @@ from typing import Annotated
 
 import typer
 
+from vusfa.cli.sources import Force, check_target, scene_path
+
 __all__ = ["register"]
 
 
@@ -16,8 +18,9 @@ def register(scenes: typer.Typer) -> None:
 
 
 def compact(
-    source: Annotated[Path, typer.Argument(help="Scene file to read.", show_default=False)],
+    source: Annotated[str, typer.Argument(help="Bundled name or scene file.", show_default=False)],
     target: Annotated[Path, typer.Argument(help="Scene file to write.", show_default=False)],
+    force: Force = False,
 ) -> None:
     """Make a small copy of a scene: float16 features, JPEG pictures, compressed tables.
 
@@ -29,4 +32,7 @@ def compact(
     """
     from vusfa.sources.compact import compact as write_compact
 
-    write_compact(source, target)
+    path = scene_path(source)
+    check_target(target, force)
+    write_compact(path, target)
+    typer.echo(f"{target}: {target.stat().st_size / 1e6:.1f} MB, from {path.stat().st_size / 1e6:.1f} MB")

@@ -8,13 +8,15 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from vusfa.cli.sources import Force, check_target
+
 if TYPE_CHECKING:
     from vusfa.deploy import Navigator
 
 __all__ = ["register"]
 
 _AGENT = typer.Argument(
-    help="Checkpoint of vusfa train, or a name of vusfa pretrained list.",
+    help="Checkpoint or folder of vusfa train, or a name of vusfa pretrained list.",
     metavar="CHECKPOINT",
     show_default=False,
 )
@@ -25,8 +27,8 @@ _LAYER = typer.Option(help="Layer of the backbone whose output is taken.")
 
 def register(app: typer.Typer) -> None:
     """Add the commands."""
-    app.command("run")(run)
-    app.command("export")(export)
+    app.command("run", rich_help_panel="Agents")(run)
+    app.command("export", rich_help_panel="Agents")(export)
 
 
 def _load(
@@ -126,6 +128,7 @@ def export(
     backbone: Annotated[str | None, _BACKBONE] = None,
     weights: Annotated[Path | None, _WEIGHTS] = None,
     layer: Annotated[str | None, _LAYER] = None,
+    force: Force = False,
 ) -> None:
     """Write backbone, normalization and agent as one ONNX file, and compare it with PyTorch over a walk.
 
@@ -138,6 +141,7 @@ def export(
     """
     from vusfa.deploy.export import export_onnx, largest_difference
 
+    check_target(target, force)
     navigator = _load(agent, backbone, weights, layer, scene=scene, threshold=threshold)
     export_onnx(navigator, target)
     typer.echo(f"{target}: {target.stat().st_size / 1e6:.1f} MB, model {navigator.agent.config['model']}")

@@ -7,6 +7,8 @@ from typing import Annotated, Any
 
 import typer
 
+from vusfa.cli.sources import Force, check_target, scene_path
+
 __all__ = ["network_options", "register"]
 
 
@@ -39,8 +41,10 @@ def network_options(**options: Any) -> dict[str, Any]:
 
 
 def encode(
-    source: Annotated[Path, typer.Argument(help="Scene file with pictures.", show_default=False)],
-    target: Annotated[Path, typer.Argument(help="File to write; may be the same.", show_default=False)],
+    source: Annotated[str, typer.Argument(help="Bundled name or scene file.", show_default=False)],
+    target: Annotated[
+        Path, typer.Argument(help="File to write; may be the same, with --force.", show_default=False)
+    ],
     backbone: Annotated[
         str, typer.Option(help="efficientnet-lite0, torchvision:MODEL, timm:MODEL, a .pt or an .onnx file.")
     ] = "efficientnet-lite0",
@@ -66,6 +70,7 @@ def encode(
         bool, typer.Option("--bfloat16", help="Compute in bfloat16 if the first batch is as good that way.")
     ] = False,
     device: Annotated[str, typer.Option(help="cpu, cuda, cuda:1 ...")] = "cpu",
+    force: Force = False,
 ) -> None:
     """Compute a scene's features anew from its pictures, by another network or with other crops.
 
@@ -86,11 +91,13 @@ def encode(
     from vusfa.sources.backbones import load_backbone
     from vusfa.sources.encode import encode_scene
 
+    path = scene_path(source)
+    check_target(target, force)
     usable_device(device)  # before the pictures are read
     options = network_options(crops=crops, size=size, resize=resize, mean=mean, std=std)
     network = load_backbone(backbone, weights=weights, layer=layer, device=device, **options)
     with resumed("encoding", "pictures") as report:
-        scene = encode_scene(source, target, network, batch=batch, bfloat16=bfloat16, progress=report)
+        scene = encode_scene(path, target, network, batch=batch, bfloat16=bfloat16, progress=report)
     said = f"{target}: {scene.num_states} states, {scene.num_crops} crops of {scene.feature_size} features"
     precision = scene.attributes["feature_precision"]
     typer.echo(f"{said}; {scene.attributes['feature']}")

@@ -1,7 +1,7 @@
-"""Functions as commands: parameters become arguments and options, docstrings their help.
+"""The grammar of all commands, and functions as commands: parameters become arguments, docstrings their help.
 
-A parameter that may be given by position is an argument, a keyword-only one an option. Options that take a
-list take all words up to the next option, ``--seeds 0 1 2``.
+A parameter that may be given by position is an argument, a keyword-only one an option. Options are written as
+settings of a training are, ``seeds=[0,1,2]``, or with dashes, ``--seeds 0 1 2``.
 """
 
 from __future__ import annotations
@@ -11,33 +11,76 @@ import inspect
 import re
 import signal
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from importlib import import_module
 from operator import getitem
 from typing import Annotated, Any, get_type_hints
 
 import typer
-from typer.core import TyperCommand
+from typer.core import TyperCommand, TyperOption
 
+from vusfa.cli import Forwarded
 from vusfa.errors import VusfaError
 
-__all__ = ["as_command", "forward", "make_app", "run_functions"]
+__all__ = ["App", "as_command", "forward", "make_app", "run_functions"]
 
 
-class _ListCommand(TyperCommand):
-    """Lets an option take several words: ``--seeds 0 1`` is ``--seeds 0 --seeds 1``."""
+class Command(TyperCommand):
+    """A command whose options may be written ``name=value``, and take lists: ``[0,1]``, ``--seeds 0 1``."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Repeat the option's name before each word."""
-        lists = {name for param in self.params if getattr(param, "multiple", False) for name in param.opts}
-        option, words = "", []
-        for word in args:
-            if word.startswith("--"):
-                option = word if word in lists else ""
-                words += [] if option else [word]
+        """Write every option as click reads it: ``--name=value``, once per value."""
+        options = {
+            name: param for param in self.params if isinstance(param, TyperOption) for name in param.opts
+        }
+        words: list[str] = []
+        taking: TyperOption | None = None  # the option before this word, if that takes words
+        for place, word in enumerate(args):
+            name, equals, value = word.partition("=")
+            setting = options.get("--" + name.replace("_", "-")) if equals and name.isidentifier() else None
+            if word == "--":
+                words += args[place:]
+                break
+            if word.startswith("-") and len(word) > 1:
+                taking = options.get(word)
+                if taking is not None and taking.is_flag:
+                    taking = None
+                words += [] if taking is not None and taking.multiple else [word]
+            elif taking is not None and not taking.multiple:
+                words, taking = [*words, word], None
+            elif setting is not None:
+                taking = None
+                words += _spelled(setting, value)
             else:
-                words += [option, word] if option else [word]
+                words += [word] if taking is None else [taking.opts[0], word]
         return super().parse_args(ctx, words)
+
+
+def _spelled(option: TyperOption, value: str) -> list[str]:
+    """An option with dashes; of a flag ``true`` or ``false``."""
+    if option.is_flag:
+        spelled = {"true": option.opts[:1], "false": option.secondary_opts[:1]}
+        return spelled.get(value.lower(), [f"{option.opts[0]}={value}"])  # the latter click refuses
+    if option.multiple:
+        return [f"{option.opts[0]}={item.strip()}" for item in value.strip("[]").split(",") if item.strip()]
+    return [f"{option.opts[0]}={value}"]
+
+
+class App(typer.Typer):
+    """A group of commands that share the grammar, and the looks of their help."""
+
+    def __init__(self, **settings: Any) -> None:
+        looks: dict[str, Any] = {
+            "no_args_is_help": True,
+            "rich_markup_mode": "markdown",
+            "pretty_exceptions_enable": False,
+            "context_settings": {"help_option_names": ["-h", "--help"]},
+        }
+        super().__init__(**{**looks, **settings})
+
+    def command(self, name: str | None = None, **settings: Any) -> Any:  # type: ignore[override]
+        """As of :class:`typer.Typer`."""
+        return super().command(name, **{"cls": Command, **settings})
 
 
 def as_command(function: Callable[..., Any]) -> Callable[..., Any]:
@@ -84,11 +127,20 @@ def as_command(function: Callable[..., Any]) -> Callable[..., Any]:
     return command
 
 
-def make_app(functions: Mapping[str, Callable[..., Any]]) -> typer.Typer:
-    """An application of functions by name; one called "" is the application itself."""
-    app = typer.Typer(pretty_exceptions_enable=False, add_completion=False)
+def make_app(functions: Mapping[str, Callable[..., Any]], examples: Sequence[str] = ()) -> typer.Typer:
+    """An application of functions by name; one called "" is the application itself.
+
+    Args:
+        functions: by name.
+        examples: command lines; the help of each function ends with its own.
+    """
+    app = App(add_completion=False, no_args_is_help="" not in functions)
     for name, function in functions.items():
-        app.command(name or None, cls=_ListCommand)(as_command(function))
+        command = as_command(function)
+        own = [line for line in examples if not name or line.split()[2] == name]
+        if own:
+            command.__doc__ = f"{command.__doc__}\n\nExamples:\n\n" + "".join(f"    {line}\n" for line in own)
+        app.command(name or None)(command)
     return app
 
 
@@ -102,31 +154,31 @@ def run_functions(function: Callable[..., Any] | None = None, /, **subcommands: 
     make_app(subcommands if function is None else {"": function})()
 
 
-def forward(app: typer.Typer, name: str, words: str, functions: Mapping[str, str]) -> None:
+def forward(app: typer.Typer, name: str, forwarded: Forwarded) -> None:
     """Add functions to an application as one command that imports them when it runs.
 
     Args:
         app: gets the command.
         name: of the command.
-        words: its help in the list of commands.
-        functions: ``module.function`` by the subcommand's name; "" where there is one function.
+        forwarded: what it runs.
     """
 
     @app.command(
         name,
-        help=words,
+        help=forwarded.words,
+        rich_help_panel=forwarded.panel,
         add_help_option=False,
         context_settings={"allow_extra_args": True, "ignore_unknown_options": True},
     )
     def command(context: typer.Context) -> None:
         try:
-            found = {key: _import(place) for key, place in functions.items()}
+            found = {key: _import(place) for key, place in forwarded.functions.items()}
         except ModuleNotFoundError as error:
             if (error.name or "").startswith("vusfa"):
                 raise
             typer.echo(f"error: {error}: pip install 'vusfa[recipes,report]'", err=True)
             raise typer.Exit(1) from error
-        make_app(found)(args=context.args, prog_name=context.command_path)
+        make_app(found, forwarded.examples)(args=context.args, prog_name=context.command_path)
 
 
 def _import(place: str) -> Callable[..., Any]:

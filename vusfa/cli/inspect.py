@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from vusfa.cli.sources import scene_paths, scenes_in
 from vusfa.errors import SceneError, printable
 
 if TYPE_CHECKING:
@@ -16,8 +17,6 @@ if TYPE_CHECKING:
     from vusfa.sources.summary import Summary
 
 __all__ = ["register"]
-
-_ENDINGS = (".h5", ".hdf5")
 
 
 def register(scenes: typer.Typer) -> None:
@@ -59,7 +58,7 @@ def list_scenes(
     from vusfa.sources.summary import by_name, summarize
 
     bundled = {name: bundled_path(name) for name in bundled_names()}
-    paths = _find(sources, bundled)
+    paths = scene_paths(sources) if sources else [*bundled.values(), *scenes_in(Path())]
     rows: list[tuple[Path, Summary | SceneError]] = []
     with progress("measuring", len(paths), "scenes") as advance:
         for path in paths:
@@ -84,49 +83,6 @@ def list_scenes(
         raise typer.Exit(1)
 
 
-def _find(sources: list[str] | None, bundled: dict[str, Path]) -> list[Path]:
-    """Files that the arguments mean, each once."""
-    found: dict[Path, None] = {}
-    if not sources:
-        found.update(dict.fromkeys(bundled.values()))
-        found.update(dict.fromkeys(_in_folder(Path())))
-    for source in sources or ():
-        path = Path(source)
-        if source in bundled:
-            found[bundled[source]] = None
-        elif path.is_dir():
-            inside = _in_folder(path)
-            if not inside:
-                raise SceneError(f"{path}: has no scene files in it; they end in {' or '.join(_ENDINGS)}")
-            found.update(dict.fromkeys(inside))
-        elif path.is_file() or path.suffix:
-            found[path] = None
-        else:
-            raise SceneError(
-                f"{source!r} is neither a bundled scene ({', '.join(bundled)}) nor a file or folder; check"
-                f" the name"
-            )
-    return list(found)
-
-
-def _in_folder(folder: Path) -> list[Path]:
-    """Files that may be scenes; HDF5 files of other programs, without a graph, are passed over."""
-    from vusfa.scenes.hdf5 import opened
-
-    found = []
-    for path in sorted(folder.iterdir()):
-        if path.suffix not in _ENDINGS or not path.is_file() or path.name.startswith("."):
-            continue
-        try:
-            with opened(path) as file:
-                is_scene = file.get("graph", getlink=True) is not None
-        except SceneError:
-            is_scene = True  # or was: its fault is reported later
-        if is_scene:
-            found.append(path)
-    return found
-
-
 def _as_json(label: str, found: Summary | SceneError) -> dict[str, Any]:
     if isinstance(found, SceneError):
         return {"file": label, "error": str(found)}
@@ -137,7 +93,7 @@ def show(
     scene: Annotated[str, typer.Argument(help="Bundled name or scene file.", show_default=False)],
     output: Annotated[
         Path | None,
-        typer.Option("--output", "-o", help="The PNG; by default SCENE.png, here."),
+        typer.Option("--out", "-o", "--output", help="The PNG; by default SCENE.png, here."),
     ] = None,
     pictures: Annotated[int, typer.Option(min=1, max=100, help="How many pictures to show.")] = 12,
 ) -> None:
@@ -198,9 +154,14 @@ def _indented(attributes: dict[str, Any], longest: int | None = None) -> list[st
 
 
 def check(
-    files: Annotated[list[Path], typer.Argument(help="Scene files.", metavar="FILE...", show_default=False)],
+    sources: Annotated[
+        list[str],
+        typer.Argument(
+            help="Bundled names, scene files, folders of them.", metavar="SCENE|DIR...", show_default=False
+        ),
+    ],
 ) -> None:
-    """Say everything that is wrong with scene files; exit code 1 if anything is.
+    """List everything that is wrong with scenes; exit code 1 if anything is.
 
     The loader's own rules: shapes and types, every move of the graph, the shortest paths by a search of
     it, the features, the poses, and every picture.
@@ -208,11 +169,12 @@ def check(
     Examples:
 
         vusfa scenes check room.h5
-        vusfa scenes check dumps/*.h5
+        vusfa scenes check bathroom dumps/
     """
     from vusfa.cli.progress import progress
     from vusfa.scenes import validate
 
+    files = scene_paths(sources)
     found = {}
     with progress("checking", len(files), "files") as advance:
         for path in files:

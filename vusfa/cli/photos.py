@@ -8,6 +8,7 @@ from typing import Annotated, Any
 
 import typer
 
+from vusfa.cli.sources import Force, check_target
 from vusfa.errors import SceneError
 
 __all__ = ["register"]
@@ -28,7 +29,8 @@ def register(scenes: typer.Typer) -> None:
 def from_photos(
     folder: Annotated[Path, typer.Argument(help="Photographs, JPEG or PNG.", show_default=False)],
     output: Annotated[
-        Path | None, typer.Option("--output", "-o", help="Scene file; by default the folder's name with .h5.")
+        Path | None,
+        typer.Option("--out", "-o", "--output", help="Scene file; by default the folder's name with .h5."),
     ] = None,
     poses: Annotated[
         Path | None, typer.Option(help="CSV file,x,z,heading; by default poses.csv in the folder.")
@@ -56,7 +58,7 @@ def from_photos(
     by: Annotated[str | None, typer.Option(help="Who took the photographs.")] = None,
     licence: Annotated[list[str] | None, typer.Option(help="Licence; may be given more than once.")] = None,
     credit: Annotated[list[str] | None, typer.Option(help="Whom to name; more than once.")] = None,
-    force: Annotated[bool, typer.Option("--force", help="Replace the scene file if there is one.")] = False,
+    force: Force = False,
 ) -> None:
     """Make a scene of photographs that were taken at known poses.
 
@@ -83,8 +85,7 @@ def from_photos(
     from vusfa.sources.photos import lay_out, read_features, read_photos
 
     target = output or Path(f"{folder.resolve().name}.h5")
-    if target.exists() and not force:
-        raise SceneError(f"{target}: exists; choose another name with -o, or replace it with --force")
+    check_target(target, force)
     width, height = _size(size)
     layout = lay_out(folder, poses, edges, step=step, turn=turn)
     # One text: HDF5 has room for some thousand only where they are a list.

@@ -7,20 +7,23 @@ from typing import Annotated
 
 import typer
 
+from vusfa.cli.functions import App
+
 __all__ = ["register"]
 
 
 def register(app: typer.Typer) -> None:
     """Add the commands."""
-    group = typer.Typer(
-        no_args_is_help=True,
-        rich_markup_mode="markdown",
-        context_settings={"help_option_names": ["-h", "--help"]},
-    )
+    group = App()
     group.command("list")(list_agents)
     group.command("show")(show)
     group.command("make")(make)
-    app.add_typer(group, name="pretrained", help="Trained agents that come with the package.")
+    app.add_typer(
+        group,
+        name="pretrained",
+        help="Look at the trained agents that come with the package.",
+        rich_help_panel="Agents",
+    )
 
 
 def list_agents() -> None:

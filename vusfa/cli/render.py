@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from vusfa.errors import ConfigError, SceneError
+from vusfa.cli.sources import Force, check_target
+from vusfa.errors import ConfigError
 
 if TYPE_CHECKING:
     from vusfa.sources.render.plan import Plan
@@ -21,6 +22,7 @@ def register(scenes: typer.Typer) -> None:
 
 
 def _plan(plan: Path | None, kind: str | None, flat: str | None, seed: int, cells: int | None) -> Plan:
+    from vusfa.sources.render import catalogue
     from vusfa.sources.render.flat import flat as draw_flat
     from vusfa.sources.render.layout import layout
     from vusfa.sources.render.plan_file import load_plan
@@ -30,7 +32,8 @@ def _plan(plan: Path | None, kind: str | None, flat: str | None, seed: int, cell
     if plan is not None:
         if cells is not None:
             raise ConfigError("--cells belongs to --kind and --flat; a plan has its size")
-        return load_plan(plan)
+        bundled = Path(catalogue.__file__).with_name("plans") / f"{plan}.yaml"
+        return load_plan(bundled if bundled.is_file() and not plan.is_file() else plan)
     if flat is not None:
         return draw_flat([room.strip() for room in flat.split(",")], seed, cells)
     assert kind is not None
@@ -38,7 +41,9 @@ def _plan(plan: Path | None, kind: str | None, flat: str | None, seed: int, cell
 
 
 def render(
-    plan: Annotated[Path | None, typer.Option(help="Plan of the room, a YAML file.")] = None,
+    plan: Annotated[
+        Path | None, typer.Option(help="Plan of the room: a YAML file, or the name of a bundled room.")
+    ] = None,
     kind: Annotated[
         str | None, typer.Option(help="Draw a bathroom, bedroom, kitchen, living_room or hall.")
     ] = None,
@@ -52,7 +57,9 @@ def render(
     ] = None,
     output: Annotated[
         Path | None,
-        typer.Option("--output", "-o", help="File to write; by default KIND-SEED or the plan's name."),
+        typer.Option(
+            "--out", "-o", "--output", help="File to write; by default KIND-SEED or the plan's name."
+        ),
     ] = None,
     plan_only: Annotated[
         bool, typer.Option("--plan-only", help="Write the plan, a YAML file to look at and change.")
@@ -68,7 +75,7 @@ def render(
         int | None,
         typer.Option(min=1, help="Threads that render; by default one for each core, without LLVM one."),
     ] = None,
-    force: Annotated[bool, typer.Option("--force", help="Replace the file if there is one.")] = False,
+    force: Force = False,
 ) -> None:
     """Render a room or a flat: from its plan, or drawn and furnished from a kind and a seed.
 
@@ -86,6 +93,8 @@ def render(
 
         vusfa scenes render --plan kitchen.yaml -o kitchen.h5
 
+        vusfa scenes render --plan bathroom -o again.h5
+
         vusfa scenes render --flat kitchen,hall,bedroom,bathroom --cells 500
     """
     from vusfa.sources.render.grid import poses
@@ -93,8 +102,7 @@ def render(
 
     name = plan.stem if plan is not None else f"{kind or 'flat'}-{seed}"
     target = output or Path(f"{name}.yaml" if plan_only else f"{name}.h5")
-    if target.exists() and not force:
-        raise SceneError(f"{target}: exists; choose another name with -o, or replace it with --force")
+    check_target(target, force)
     room = _plan(plan, kind, flat, seed, cells)
     if plan_only:
         from vusfa.sources.render.catalogue import Catalogue

@@ -8,12 +8,11 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 from vusfa.conf.schema import validated
 from vusfa.errors import CheckpointError, ConfigError
-from vusfa.training.checkpoint import load_checkpoint
+from vusfa.training.checkpoint import checkpoint_file, load_checkpoint
 
 __all__ = ["resumed_settings"]
 
@@ -31,7 +30,7 @@ def resumed_settings(given: Mapping[str, Any], overrides: Sequence[str]) -> dict
         CheckpointError: the checkpoint cannot be read, or holds settings that there are none of.
         ConfigError: an override that a resumed run cannot take.
     """
-    path = Path(given["resume"])
+    path = checkpoint_file(given["resume"])
     state = load_checkpoint(path)
     try:
         stored = validated(_completed(state["config"], given), where=f"{path}: ")

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
+
+from vusfa.cli.sources import Force, check_target
 
 __all__ = ["register"]
 
@@ -16,7 +18,12 @@ def register(scenes: typer.Typer) -> None:
 
 
 def export_thor(
-    scene: Annotated[str, typer.Argument(help="The simulator's scene: FloorPlan212.", show_default=False)],
+    scene: Annotated[
+        str,
+        typer.Argument(
+            help="The simulator's scene, FloorPlan212, or a ProcTHOR house, a .json file.", show_default=False
+        ),
+    ],
     target: Annotated[Path, typer.Argument(help="File to write.", show_default=False)],
     grid: Annotated[float, typer.Option(min=0.05, help="Metres between places.")] = 0.5,
     width: Annotated[int, typer.Option(min=1, help="Width of the pictures in pixels.")] = 400,
@@ -35,6 +42,7 @@ def export_thor(
     layer: Annotated[str | None, typer.Option(help="Layer whose output is taken, such as avgpool.")] = None,
     crops: Annotated[str | None, typer.Option(help="whole (squashed), centre, or ten.")] = None,
     batch: Annotated[int, typer.Option(min=1, help="Pictures encoded at a time.")] = 32,
+    force: Force = False,
 ) -> None:
     """Make a scene from a live AI2-THOR 5 simulator (`pip install 'vusfa[thor]'`).
 
@@ -47,12 +55,16 @@ def export_thor(
         vusfa scenes export-thor FloorPlan212 living_room.h5
 
         vusfa scenes export-thor FloorPlan401 bathroom.h5 --grid 0.25 --headless
+
+        vusfa scenes export-thor house.json house.h5
     """
     from vusfa.cli.resumed import resumed
     from vusfa.errors import ConfigError
     from vusfa.sources.backbones import load_backbone
     from vusfa.sources.thor import export
 
+    check_target(target, force)
+    house = _house(scene)
     network = load_backbone(backbone, weights=weights, layer=layer, crops=crops)
     try:
         from ai2thor import __version__ as version
@@ -62,13 +74,15 @@ def export_thor(
         raise ConfigError("AI2-THOR is missing: pip install 'vusfa[thor]'") from error
     settings = {"fieldOfView": field_of_view, "gridSize": grid, "width": width, "height": height}
     platform = {"platform": CloudRendering} if headless else {}
-    controller = Controller(scene=scene, snapToGrid=True, rotateStepDegrees=90, **settings, **platform)
+    controller = Controller(
+        scene=house or scene, snapToGrid=True, rotateStepDegrees=90, **settings, **platform
+    )
     try:
         with resumed("visiting", "poses") as visited, resumed("encoding", "pictures") as encoded:
             room = export(
                 controller,
                 target,
-                name=scene,
+                name=scene if house is None else Path(scene).stem,
                 step=grid,
                 horizon=horizon,
                 backbone=network,
@@ -85,3 +99,18 @@ def export_thor(
         f"{target}: {room.num_states} states; {left_out} places left out because the agent could not be put"
         f" there, {astray} moves taken for blocked because they ended at no known pose"
     )
+
+
+def _house(scene: str) -> dict[str, Any] | None:
+    """The house in a file of ProcTHOR's JSON; None where the scene is a name."""
+    if not scene.endswith(".json"):
+        return None
+    from vusfa.errors import SceneError
+    from vusfa.reading import read_json
+
+    mend = "give the JSON object of one house"
+    house = read_json(scene, SceneError, mend)
+    missing = [key for key in ("rooms", "walls", "metadata") if key not in house]
+    if missing:
+        raise SceneError(f"{scene}: no ProcTHOR house ({missing[0]!r} is missing); {mend}")
+    return house

@@ -22,10 +22,16 @@ _HYDRA: dict[str, Any] = {
     },
 }
 
+#: Options of Hydra's own; everything else is a setting.
+_HYDRA_OPTIONS = {
+    *("help", "hydra-help", "version", "cfg", "resolve", "package", "run", "multirun", "info"),
+    *("shell-completion", "config-path", "config-name", "config-dir", "experimental-rerun"),
+}
+
 
 def register(app: typer.Typer) -> None:
     """Adds the command."""
-    app.command("train", **_HYDRA)(train)
+    app.command("train", rich_help_panel="Agents", **_HYDRA)(train)
 
 
 def train(context: typer.Context) -> None:
@@ -37,9 +43,18 @@ def train(context: typer.Context) -> None:
         typer.echo(f"error: vusfa train needs {error.name}: pip install 'vusfa[recipes]'", err=True)
         raise typer.Exit(1) from error
 
+    for word in context.args:
+        name, _, value = word.removeprefix("--").partition("=")
+        if word.startswith("--") and name and name not in _HYDRA_OPTIONS:
+            setting = f"{name.replace('-', '_')}={value or 'VALUE'}"
+            typer.echo(f"error: {word}: settings are written without dashes, {setting}", err=True)
+            raise typer.Exit(2)
+
     def job(settings: dict[str, Any], overrides: list[str]) -> int:
         trainer, _, exit_code = training.train(settings, overrides)
-        say(f"{trainer.settings['folder']}/checkpoint.pt")
+        folder = trainer.settings["folder"]
+        say(f"next: vusfa report {folder}, vusfa film {folder}, vusfa evaluate {folder}")
+        say(f"{folder}/checkpoint.pt")
         return exit_code
 
     sys.argv = ["vusfa train", *context.args]

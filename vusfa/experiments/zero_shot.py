@@ -15,6 +15,7 @@ from vusfa.files import check_folder
 from vusfa.scenes import SceneSet
 from vusfa.training import (
     EvaluationProgress,
+    checkpoint_file,
     load_agent,
     make_observation,
     rebuild_agent,
@@ -46,7 +47,7 @@ def zero_shot(
     shortest path. zero_shot.csv, zero_shot.json and zero_shot_episodes.csv are written beside the checkpoint.
 
     Args:
-        checkpoint: the file.
+        checkpoint: the file, or the folder of a run.
         scenes: bundled names and files, in order, if they have moved since the training.
         episodes: per goal.
         max_steps: limit of actions per episode.
@@ -62,6 +63,7 @@ def zero_shot(
         out: where to write, without suffix; zero_shot beside the checkpoint by default.
     """
     set_threads(threads)
+    checkpoint = checkpoint_file(checkpoint)
     stem = out or checkpoint.with_name("zero_shot")
     check_folder(stem.parent, "out")
     rooms = None if scenes is None else SceneSet.open(scenes)

@@ -11,11 +11,13 @@ from tensordict.nn import TensorDictModuleBase
 
 from vusfa.envs.dynamics import MAX_STEPS
 from vusfa.envs.rendering import draw_panels
+from vusfa.errors import SceneError
 from vusfa.evaluation import Episodes, trails
+from vusfa.evaluation.navigation import Observe
 from vusfa.files import replacing
 from vusfa.scenes import SceneSet
 
-__all__ = ["draw_film", "longest_success", "record_walk", "write_gif"]
+__all__ = ["draw_film", "farthest_pair", "longest_success", "record_walk", "write_gif"]
 
 _TITLE_HEIGHT = 22
 _INK, _PAPER = (60, 64, 72), (255, 255, 255)
@@ -35,6 +37,48 @@ def longest_success(episodes: Episodes, scenes: SceneSet) -> tuple[int, int] | N
     )
 
 
+def farthest_pair(
+    scenes: SceneSet,
+    scene: str | int,
+    start: int | None = None,
+    goal: int | None = None,
+    goals: torch.Tensor | None = None,
+) -> tuple[int, int]:
+    """Start and goal, global ids, with the longest shortest path in a scene.
+
+    Args:
+        scenes: the world.
+        scene: name or index.
+        start, goal: local ids; one that is given is kept.
+        goals: (G,) global ids from which the goal is chosen, such as the trained ones; those of other scenes
+            are passed over.
+
+    Raises:
+        SceneError: there is no such scene or state, or no way from the start to the goal.
+
+    >>> farthest_pair(SceneSet.bundled(["bathroom"]), "bathroom", goal=9)
+    (173, 9)
+    """
+    index = scenes.scene_index(scene)
+    chosen = scenes.scenes[index]
+    for given in (start, goal):
+        if given is not None:
+            scenes.global_id(index, given)  # raises for a state that is not there
+    distance = chosen.distance
+    rows = torch.arange(chosen.num_states) if start is None else torch.tensor([start])
+    columns = torch.arange(chosen.num_states)
+    if goal is not None:
+        columns = torch.tensor([goal])
+    elif goals is not None and (scenes.scene_id[goals] == index).any():
+        columns = scenes.local_id(goals[scenes.scene_id[goals] == index])
+    table = distance[rows][:, columns]
+    best = int(table.argmax())
+    if table.flatten()[best] < 0:
+        raise SceneError(f"scene {chosen.name!r}: no way leads from state {start} to state {goal}")
+    found = rows[best // len(columns)], columns[best % len(columns)]
+    return int(scenes.global_id(index, found[0])), int(scenes.global_id(index, found[1]))
+
+
 def record_walk(
     policy: TensorDictModuleBase,
     scenes: SceneSet,
@@ -45,6 +89,7 @@ def record_walk(
     history: int = 4,
     attempts: int = 10,
     seed: int = 0,
+    observe: Observe | None = None,
 ) -> list[int]:
     """Trajectory of a policy with sampled actions.
 
@@ -56,12 +101,15 @@ def record_walk(
         history: frames in ``state_id``.
         attempts: episodes, of which the shortest successful one is taken.
         seed: of the actions; the caller's random state stays.
+        observe: see :func:`vusfa.evaluation.evaluate`.
 
     Returns:
         global ids of the visited states, start and end included.
     """
     starts, goals = torch.full((attempts,), start), torch.full((attempts,), goal)
-    ways = trails(policy, scenes, starts, goals, max_steps=max_steps, history=history, seed=seed)
+    ways = trails(
+        policy, scenes, starts, goals, max_steps=max_steps, history=history, seed=seed, observe=observe
+    )
     return min(ways, key=lambda way: len(way) if way[-1] == goal else max_steps + 2)
 
 

@@ -7,6 +7,7 @@ True
 
 from vusfa.deprecated import moved_names
 from vusfa.training.checkpoint import (
+    checkpoint_file,
     load_agent,
     load_checkpoint,
     rebuild_agent,
@@ -36,6 +37,7 @@ __all__ = [
     "StopOnSignal",
     "Trainer",
     "check_goals_dealt",
+    "checkpoint_file",
     "descend",
     "load_agent",
     "load_checkpoint",

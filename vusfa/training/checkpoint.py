@@ -51,6 +51,7 @@ __all__ = [
     "check_fits",
     "check_scenes",
     "check_setting",
+    "checkpoint_file",
     "differences",
     "load_agent",
     "load_checkpoint",
@@ -90,17 +91,22 @@ def save_checkpoint(path: str | Path, state: Mapping[str, Any]) -> Path:
     return Path(path)
 
 
+def checkpoint_file(path: str | Path) -> Path:
+    """The checkpoint itself, or that of a run's folder."""
+    return Path(path, "checkpoint.pt") if os.path.isdir(path) else Path(path)
+
+
 def load_checkpoint(path: str | Path, device: torch.device | str = "cpu") -> dict[str, Any]:
     """Read a checkpoint; no code in it is run.
 
     Args:
-        path: a file that :func:`save_checkpoint` wrote.
+        path: a file that :func:`save_checkpoint` wrote, or the folder of a run.
         device: where its tensors go.
 
     Raises:
         CheckpointError: there is no such file, it is damaged, or it is no checkpoint of this package.
     """
-    path = Path(path)
+    path = checkpoint_file(path)
     if not os.path.isfile(path):  # Path.is_file raises in a folder that may not be looked into
         raise CheckpointError(f"{path}: no such checkpoint; vusfa train writes RUN/checkpoint.pt")
     state = read_content(path, device)

@@ -1,0 +1,92 @@
+"""What every command that reads or writes scene files has in common: names, folders, ``--force``."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from vusfa.errors import ConfigError, SceneError
+
+__all__ = ["Force", "check_target", "scene_path", "scene_paths"]
+
+_ENDINGS = (".h5", ".hdf5")
+
+#: The option of commands that write a file.
+Force = Annotated[bool, typer.Option("--force", help="Replace the file if it exists.")]
+
+
+def check_target(target: Path, force: bool) -> None:
+    """Refuse, before the work, a file that exists or that could not be written.
+
+    Raises:
+        ConfigError: it exists and ``force`` is not given, or its folder cannot be written.
+    """
+    from vusfa.files import check_folder
+
+    if target.is_dir():
+        raise ConfigError(f"{target}: is a folder; name the file to write")
+    if target.exists() and not force:
+        raise ConfigError(f"{target}: exists; choose another name, or replace it with --force")
+    check_folder(target.absolute().parent, "the folder of the file to write")
+
+
+def scene_path(source: str | Path) -> Path:
+    """The file of a scene: a bundled name, or a path.
+
+    Raises:
+        SceneError: neither.
+
+    >>> scene_path("kitchen").name, scene_path("rooms/mine.h5").name
+    ('kitchen.h5', 'mine.h5')
+    """
+    from vusfa.scenes import bundled_names
+    from vusfa.scenes.store import bundled_path
+
+    path = Path(source)
+    if str(source) in bundled_names():
+        return bundled_path(str(source))
+    if not path.is_file() and not path.suffix:
+        raise SceneError(
+            f"{str(source)!r} is neither a bundled scene ({', '.join(bundled_names())}) nor a file or folder;"
+            f" check the name"
+        )
+    return path
+
+
+def scene_paths(sources: Sequence[str]) -> list[Path]:
+    """Files that names, files and folders mean, each once.
+
+    Raises:
+        SceneError: a name that means nothing, or a folder without scene files.
+    """
+    found: dict[Path, None] = {}
+    for source in sources:
+        if Path(source).is_dir():
+            inside = scenes_in(Path(source))
+            if not inside:
+                raise SceneError(f"{source}: has no scene files in it; they end in {' or '.join(_ENDINGS)}")
+            found.update(dict.fromkeys(inside))
+        else:
+            found[scene_path(source)] = None
+    return list(found)
+
+
+def scenes_in(folder: Path) -> list[Path]:
+    """Files that may be scenes; HDF5 files of other programs, without a graph, are passed over."""
+    from vusfa.scenes.hdf5 import opened
+
+    found = []
+    for path in sorted(folder.iterdir()):
+        if path.suffix not in _ENDINGS or not path.is_file() or path.name.startswith("."):
+            continue
+        try:
+            with opened(path) as file:
+                is_scene = file.get("graph", getlink=True) is not None
+        except SceneError:
+            is_scene = True  # or was: its fault is reported later
+        if is_scene:
+            found.append(path)
+    return found
