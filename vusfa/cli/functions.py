@@ -78,7 +78,7 @@ class App(typer.Typer):
         }
         super().__init__(**{**looks, **settings})
 
-    def command(self, name: str | None = None, **settings: Any) -> Any:  # type: ignore[override]
+    def command(self, name: str | None = None, **settings: Any) -> Any:
         """As of :class:`typer.Typer`."""
         return super().command(name, **{"cls": Command, **settings})
 

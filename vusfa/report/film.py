@@ -51,32 +51,31 @@ def farthest_pair(
         scene: name or index.
         start, goal: local ids; one that is given is kept.
         goals: (G,) global ids from which the goal is chosen, such as the trained ones; those of other scenes
-            are passed over.
+            are passed over. Where none is left, the goal is state 0.
 
     Raises:
-        SceneError: there is no such scene or state, or no way from the start to the goal.
+        SceneError: there is no such scene or state, or no path from the start to the goal.
 
     >>> farthest_pair(SceneSet.bundled(["bathroom"]), "bathroom", goal=9)
     (173, 9)
     """
     index = scenes.scene_index(scene)
-    chosen = scenes.scenes[index]
-    for given in (start, goal):
-        if given is not None:
-            scenes.global_id(index, given)  # raises for a state that is not there
-    distance = chosen.distance
-    rows = torch.arange(chosen.num_states) if start is None else torch.tensor([start])
-    columns = torch.arange(chosen.num_states)
+    candidates = [] if goals is None else goals[scenes.scene_id[goals] == index].tolist()
+    candidates = candidates or [int(scenes.global_id(index, 0))]
     if goal is not None:
-        columns = torch.tensor([goal])
-    elif goals is not None and (scenes.scene_id[goals] == index).any():
-        columns = scenes.local_id(goals[scenes.scene_id[goals] == index])
-    table = distance[rows][:, columns]
-    best = int(table.argmax())
-    if table.flatten()[best] < 0:
-        raise SceneError(f"scene {chosen.name!r}: no way leads from state {start} to state {goal}")
-    found = rows[best // len(columns)], columns[best % len(columns)]
-    return int(scenes.global_id(index, found[0])), int(scenes.global_id(index, found[1]))
+        candidates = [int(scenes.global_id(index, goal))]
+    states = torch.arange(int(scenes.offsets[index]), int(scenes.offsets[index + 1]))
+    if start is not None:
+        states = scenes.global_id(index, [start])
+    found = []
+    for candidate in candidates:
+        distance = scenes.distance(states, candidate)
+        best = int(distance.argmax())
+        found.append((int(distance[best]), int(states[best]), candidate))
+    longest, first, last = max(found)
+    if longest < 0:
+        raise SceneError(f"scene {scenes.names[index]!r}: no path leads from state {start} to state {goal}")
+    return first, last
 
 
 def record_walk(
