@@ -7,7 +7,9 @@ them.
 
 from __future__ import annotations
 
+import difflib
 import re
+from collections.abc import Iterable
 
 __all__ = [
     "ActionError",
@@ -19,6 +21,7 @@ __all__ = [
     "SceneError",
     "VusfaError",
     "WorkerError",
+    "near",
     "printable",
 ]
 
@@ -34,6 +37,22 @@ def printable(text: str) -> str:
     'hall\\x1b[2J'
     """
     return _UNPRINTABLE.sub(lambda match: match[0].encode("unicode_escape").decode(), text)
+
+
+def near(word: object, choices: Iterable[object], otherwise: str | None = None) -> str:
+    """The end of a message on an unknown word: the choice that it resembles most, or what there is.
+
+    Args:
+        word: what was given.
+        choices: what there is.
+        otherwise: the end where it resembles none, in place of a list of all choices.
+
+    >>> near("optm", ["optim", "env"]), near("x", ["optim", "env"])
+    ("did you mean 'optim'?", 'there are optim, env')
+    """
+    names = [str(choice) for choice in choices]
+    found = difflib.get_close_matches(str(word)[:200], names, n=1)
+    return f"did you mean {found[0]!r}?" if found else otherwise or f"there are {', '.join(names)}"
 
 
 class VusfaError(ValueError):

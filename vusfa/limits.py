@@ -24,7 +24,7 @@ MAX_PATH_BYTES = 1 << 26
 MAX_COMPRESSION = 200
 #: The same for raw pictures, which are read some at a time: what gzip reaches with a single color.
 MAX_PICTURE_COMPRESSION = 1100
-#: Size of features beyond what is stored of them.
+#: Size of features as float32 beyond what is stored of them.
 MAX_EXTRA_BYTES = 3 << 28
 #: Size of an attribute, were all of its texts as long as the file's longest.
 MAX_ATTRIBUTE_BYTES = 1 << 28
@@ -45,6 +45,8 @@ PICTURE_FORMATS = ("JPEG", "PNG")
 MAX_PICTURE_SIDE, MAX_PHOTO_PIXELS = 4096, 90_000_000
 #: Scans of a JPEG file, each of which is decoded over the whole picture. Progressive files have about 10.
 MAX_PICTURE_SCANS = 64
+#: Pictures of a scene that are decoded when it is fetched, evenly spaced. ``vusfa scenes check`` decodes all.
+MAX_DECODED_PICTURES = 500
 #: Size of the decoded pictures that are looked at together.
 MAX_PICTURE_BYTES = 1 << 26
 

@@ -20,7 +20,7 @@ from vusfa.training import load_agent, load_checkpoint
 
 __all__ = ["COLLECTORS", "ended", "killed_until_done", "logged_frames", "start", "wait_for"]
 
-COLLECTORS = ("single", "multi_sync", "multi_async")
+COLLECTORS = ("single", "multi_sync", "multi_async", "hogwild")
 SMALL = [
     "scenes=[bathroom]", "env.goals=[3,9,12]", "env.max_steps=20", "agent.hidden_size=8",
     "agent.embedding_size=8", "agent.history=1", "collector.num_envs=6", "collector.rollout=4",
@@ -113,7 +113,7 @@ def killed_until_done(folder: Path, kind: str, kills: int, seed: int) -> int:
         how often it was killed.
     """
     draw, done, before = random.Random(f"{kind} {seed}"), 0, 0
-    command = [f"collector={kind}", f"seed={seed}", "resume=auto"]
+    command = [f"collector={kind}", f"seed={seed}", "resume=auto", "optim=a3c"]
     while done < kills:
         process = start(folder, *command, "total_frames=1000000")
         begun = wait_for(folder / "config.json", process)

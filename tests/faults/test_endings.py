@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from endings import COLLECTORS, ended, killed_until_done, start, wait_for
 
-from vusfa.training import load_checkpoint
+from vusfa.training import load_agent, load_checkpoint
 
 
 @pytest.mark.parametrize("kind", COLLECTORS)
@@ -41,16 +41,34 @@ def test_a_disk_that_is_full(tmp_path: Path):
     assert load_checkpoint(path)["frames"] == 96
 
 
-@pytest.mark.parametrize("number", [signal.SIGHUP, signal.SIGTERM])
-def test_a_signal_to_the_whole_group(tmp_path: Path, number: signal.Signals):
-    """A closed terminal, a batch system's end of time: it reaches the workers as well."""
+@pytest.mark.parametrize(
+    ("kind", "number"),
+    [
+        ("multi_async", signal.SIGHUP),
+        ("multi_async", signal.SIGINT),
+        ("hogwild", signal.SIGTERM),
+        ("single", signal.SIGTERM),
+    ],
+)
+def test_a_signal_to_the_whole_group(tmp_path: Path, kind: str, number: signal.Signals):
+    """A closed terminal, Ctrl-C, a batch system's end of time: it reaches the workers as well."""
     folder = tmp_path / "run"
-    process = start(folder, "collector=multi_async", "total_frames=1000000")
+    more = [f"collector={kind}", "preset=paper", "evaluation=trained", "evaluation.episodes_per_goal=1"]
+    process = start(folder, *more, "total_frames=1000000")
     assert wait_for(folder / "checkpoint.pt", process)
     os.killpg(process, number)
     assert ended(process) == 128 + number
     assert "error" not in (tmp_path / "run.txt").read_text()
-    load_checkpoint(folder / "checkpoint.pt")
+    frames = load_agent(folder / "checkpoint.pt")[2]["frames"]
+    # nothing half-written, and no evaluation of a training that was cut short
+    assert {path.name for path in folder.iterdir()} == {"checkpoint.pt", "config.json", "metrics.csv"}
+    if kind != "single":
+        return
+    process = start(
+        folder, f"resume={folder}/checkpoint.pt", f"total_frames={frames + 24}", "evaluation=none"
+    )
+    assert ended(process) == 0, (tmp_path / "run.txt").read_text()
+    assert load_checkpoint(folder / "checkpoint.pt")["frames"] >= frames + 24
 
 
 def test_a_folder_that_is_renamed(tmp_path: Path):

@@ -61,10 +61,10 @@ class TestOverrides:
         ("settings", "message"),
         [
             ({"model": "vufsa"}, "model is 'vufsa'; did you mean 'vusfa'"),
-            ({"model": "dqn"}, "model is 'dqn'; it must be one of 'gvf', 'usfa', 'sfdp', 'vusfa'"),
+            ({"model": "dqn"}, "model is 'dqn'; there are gvf, usfa, sfdp, vusfa"),
             ({"architecture": "control"}, "architecture is 'control'; did you mean 'controlled'"),
             ({"embeding_size": 3}, "no field 'embeding_size'; did you mean 'embedding_size'"),
-            ({"beta": 3}, "no field 'beta'; it must be one of 'history', "),
+            ({"beta": 3}, "no field 'beta'; there are history, "),
             ({"history": 0}, "history is 0; it must be a whole number"),
             ({"history": 2.5}, "history is 2.5; it must be a whole number"),
             ({"hidden_size": True}, "hidden_size is True; it must be a whole number"),

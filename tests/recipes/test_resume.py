@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import csv
+import json
 from pathlib import Path
 
 import pytest
 import torch
+from omegaconf import OmegaConf
 
+from vusfa.cli.resume import resumed_settings
 from vusfa.errors import CheckpointError
+from vusfa.report.runs import read_run
 from vusfa.training import load_checkpoint
 
 
@@ -120,6 +124,41 @@ def test_a_checkpoint_of_another_training_is_refused(
         train(settings(*small, "agent.model=vusfa", *options, f"folder={elsewhere}", f"resume={path}"), [])
     assert not elsewhere.exists()
     assert path.read_bytes() == kept
+
+
+def test_a_run_moves_with_its_scene_and_its_list_of_goals(
+    recipe, settings, small, tmp_path: Path, scene_file: Path, monkeypatch: pytest.MonkeyPatch
+):
+    """Its files hold them as seen from its folder, and nothing else of its author's disk."""
+    home, elsewhere = tmp_path / "home", tmp_path / "elsewhere"
+    home.mkdir()
+    (home / "few.yaml").write_text("hall: [3, 9]\n")
+    (home / "hall.h5").write_bytes(scene_file.read_bytes())
+    options = [f"scenes=[{home / 'hall.h5'}]", f"env.goals={home / 'few.yaml'}", "total_frames=48"]
+    recipe("train").train(settings(*small, *options, f"folder={home / 'run'}"), options)
+    config = json.loads((home / "run" / "config.json").read_text())
+    state = torch.load(home / "run" / "checkpoint.pt", weights_only=True)
+    assert str(tmp_path) not in f"{config} {state['config']} {state['overrides']}"
+    assert (config["scenes"], config["env"]["goals"]) == (["../hall.h5"], "../few.yaml")
+    home.rename(elsewhere)
+    monkeypatch.chdir(tmp_path)
+    assert Path(read_run(elsewhere / "run").scenes[0]).samefile(elsewhere / "hall.h5")
+    path = elsewhere / "run" / "checkpoint.pt"
+    options = [f"resume={path}", "total_frames=96"]
+    again = resumed_settings(OmegaConf.to_container(settings(*small, *options)), options)
+    assert Path(again["env"]["goals"]).samefile(elsewhere / "few.yaml")
+    assert recipe("train").train(again).trainer.frames == 96
+
+
+def test_paths_that_version_0_1_wrote(tmp_path: Path, scene_file: Path, monkeypatch: pytest.MonkeyPatch):
+    """As they were given: from the folder that the run was started in."""
+    (tmp_path / "run").mkdir()
+    config = {"agent": {"model": "gvf"}, "scenes": ["rooms/hall.h5"]}
+    (tmp_path / "run" / "config.json").write_text(json.dumps(config))
+    monkeypatch.chdir(tmp_path)
+    assert read_run("run").scenes == ["rooms/hall.h5"]  # where it is, or was
+    (tmp_path / "run" / "hall.h5").write_bytes(b"")
+    assert Path(read_run("run").scenes[0]).samefile("run/hall.h5")
 
 
 def test_other_scenes_are_refused(recipe, settings, small, tmp_path: Path, make_scene):

@@ -86,6 +86,7 @@ def test_a_run_learns_and_tells(recipe, settings, small, tmp_path: Path, capsys:
     assert len(rows(tmp_path / "run" / "evaluation_episodes.csv")) == 90
     config = json.loads((tmp_path / "run" / "config.json").read_text())
     assert (config["agent"]["model"], config["total_frames"]) == ("gvf", 24000)
+    assert str(tmp_path) not in str(config)
     written = capsys.readouterr()
     assert "trained goals" in written.out
     assert "random walk" in written.out

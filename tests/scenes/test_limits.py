@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import os
 import struct
+import tracemalloc
 import zlib
 from collections.abc import Callable
 from pathlib import Path
@@ -13,10 +14,12 @@ import h5py
 import numpy as np
 import pytest
 from PIL import Image
+from PIL.ImageFile import ImageFile
 
 from vusfa.errors import SceneError
 from vusfa.scenes import Scene, validate
 from vusfa.scenes.pictures import decode, stored
+from vusfa.sources.compact import compact
 
 Make = Callable[..., Path]
 
@@ -195,8 +198,49 @@ def test_features_that_swell(make_file: Make, monkeypatch: pytest.MonkeyPatch) -
     with h5py.File(path, "a") as file:
         file.create_dataset("resnet_feature", data=np.ones((5, 4, 100)), compression=9)
     assert validate(path) == []
-    monkeypatch.setattr("vusfa.limits.MAX_EXTRA_BYTES", 10_000)
-    assert "are stored; at most 10000 more are read" in fault(path)
+    monkeypatch.setattr("vusfa.limits.MAX_EXTRA_BYTES", 5_000)
+    assert "needs 8000 bytes as float32, but " in fault(path)
+
+
+@pytest.mark.parametrize("chunks", [None, (2, 1, 3)])
+@pytest.mark.parametrize("kind", ["f2", "f8", ">f4"])
+def test_features_of_any_width_are_read_and_written_by_rows(
+    make_file: Make,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    kind: str,
+    chunks: tuple[int, ...] | None,
+) -> None:
+    monkeypatch.setattr("vusfa.scenes.hdf5._NUMBERS_AT_ONCE", 30)
+    values = np.random.default_rng(0).standard_normal((5, 2, 7)).astype(kind)
+    path, damaged = make_file(resnet_feature=None), make_file("damaged.h5", resnet_feature=None)
+    with h5py.File(path, "a") as file:
+        file.create_dataset("resnet_feature", data=values, chunks=chunks)
+    scene = Scene.load(path)
+    assert scene.features.numpy().tolist() == values.astype(np.float32).tolist()
+    scene.save(tmp_path / "again.h5")
+    assert Scene.load(tmp_path / "again.h5").features.equal(scene.features)
+    compact(path, tmp_path / "small.h5")
+    assert Scene.load(tmp_path / "small.h5").features.numpy().tolist() == values.astype("f2").tolist()
+    values[4, 1, 3] = np.nan if kind == "f2" else np.inf
+    with h5py.File(damaged, "a") as file:
+        file.create_dataset("resnet_feature", data=values, chunks=chunks)
+    assert "state 4: crop 1, feature 3 is " in "".join(validate(damaged))
+
+
+@pytest.mark.parametrize(("kind", "most"), [("f2", 5.5), ("f4", 5.5), ("f8", 6.5)])
+def test_features_take_the_memory_of_float32_alone(
+    make_file: Make, monkeypatch: pytest.MonkeyPatch, kind: str, most: float
+) -> None:
+    monkeypatch.setattr("vusfa.scenes.hdf5._NUMBERS_AT_ONCE", 10_000)
+    path = make_file(resnet_feature=np.ones((5, 10, 10_000), kind))
+    tracemalloc.start()
+    try:
+        Scene.load(path)
+        _, peak = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert peak / 500_000 < most  # bytes per number
 
 
 def test_chunks_are_bounded(make_file: Make, pictures: np.ndarray, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -206,3 +250,45 @@ def test_chunks_are_bounded(make_file: Make, pictures: np.ndarray, monkeypatch: 
     assert validate(path) == []
     monkeypatch.setattr("vusfa.limits.MAX_CHUNK_BYTES", 700)
     assert "has chunks of shape (5, 6, 8, 3); at most 700 bytes" in fault(path)
+
+
+@pytest.mark.parametrize("kind", ["JPEG", "PNG"])
+@pytest.mark.parametrize("damage", ["cut off", "other size", "no picture", "empty"])
+def test_a_bad_picture_at_the_end_is_refused_before_all_others_are_decoded(
+    make_file: Make, monkeypatch: pytest.MonkeyPatch, kind: str, damage: str
+) -> None:
+    def encoded(side: int) -> bytes:
+        buffer = io.BytesIO()
+        Image.effect_noise((side, 16), 90).convert("RGB").save(buffer, kind)
+        return buffer.getvalue()
+
+    sound = encoded(20)
+    last = {"cut off": sound[:-300], "other size": encoded(21), "no picture": eps(), "empty": b""}[damage]
+    path = make_file()
+    with h5py.File(path, "a") as file:
+        dataset = file.create_dataset("observation_jpeg", (5,), h5py.vlen_dtype(np.uint8))
+        for state in range(5):
+            dataset[state] = np.frombuffer(last if state == 4 else sound, np.uint8)
+    loads: list[object] = []
+    load = ImageFile.load
+    monkeypatch.setattr(ImageFile, "load", lambda image: (loads.append(image), load(image))[1])
+    (found,) = validate(path)
+    assert "dataset 'observation_jpeg', state 4: is unusable" in found
+    assert len(set(map(id, loads))) <= 3  # of state 0, where its shape is looked up, and of the bad one
+
+
+def test_what_only_decoding_finds(make_file: Make) -> None:
+    """Damage in the middle of one; with few decoded, evenly spaced, the first and the last are among them."""
+    buffer = io.BytesIO()
+    Image.effect_noise((20, 16), 90).convert("RGB").save(buffer, "PNG")
+    sound = buffer.getvalue()
+    middle = sound[:200] + bytes(40) + sound[240:]
+    for bad, few in ((4, 2), (0, 2), (2, 3)):
+        path = make_file()
+        with h5py.File(path, "a") as file:
+            dataset = file.create_dataset("observation_jpeg", (5,), h5py.vlen_dtype(np.uint8))
+            for state in range(5):
+                dataset[state] = np.frombuffer(middle if state == bad else sound, np.uint8)
+        assert f"state {bad}: is unusable" in validate(path)[0]
+        assert f"state {bad}: is unusable" in validate(path, few)[0]
+    assert validate(make_file(), 0) == []

@@ -267,11 +267,12 @@ def test_graph_indices_out_of_range(make_file: Callable[..., Path]) -> None:
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, 1e39])
+@pytest.mark.filterwarnings("ignore:overflow")
 def test_features_that_are_no_numbers(make_file: Callable[..., Path], value: float) -> None:
     features = np.ones((5, 2, 7))
     features[3, 1, 4] = features[4] = value
     assert the_fault(make_file(resnet_feature=features)) == (
-        f"dataset 'resnet_feature', state 3 (the first of 2): crop 1, feature 4 is {value};"
+        f"dataset 'resnet_feature', state 3 (the first of 2): crop 1, feature 4 is {np.float32(value)};"
         " compute the features of this state again"
     )
 

@@ -82,12 +82,12 @@ def test_a_worker_that_dies(tmp_path: Path, kind: str, number: signal.Signals):
 
 
 @pytest.mark.usefixtures("fast_workers")
-@pytest.mark.parametrize("kind", ["multi_sync", "multi_async"])
+@pytest.mark.parametrize("kind", ["multi_sync", "multi_async", "hogwild"])
 def test_a_worker_that_is_stopped(tmp_path: Path, kind: str):
-    """In multi_async the others go on sending."""
+    """In multi_async and hogwild the others go on sending."""
     began = time.monotonic()
     stop = partial(signal_worker, signal.SIGSTOP)
-    text = ended_by(stop, tmp_path / "a.pt", f"collector={kind}", "collector.timeout=1.5")
+    text = ended_by(stop, tmp_path / "a.pt", f"collector={kind}", "collector.timeout=1.5", "optim=a3c")
     assert re.match(r"worker (0 .*, )?1 \(process \d+\) of the collector has sent nothing for 1.5 s", text)
     assert load_checkpoint(tmp_path / "a.pt")["frames"] >= 36
     assert time.monotonic() - began < 60

@@ -12,8 +12,7 @@ from torchrl.objectives import LossModule
 
 from vusfa.algorithms.base import Algorithm
 from vusfa.conf import settings
-from vusfa.conf.schema import near
-from vusfa.errors import ConfigError
+from vusfa.errors import ConfigError, near
 from vusfa.modules import Agent
 from vusfa.scenes import SceneSet
 
@@ -56,7 +55,7 @@ def make_algorithm(name: str, agent: Agent, scenes: SceneSet, all_settings: Mapp
     """
     if name not in ALGORITHMS:
         raise ConfigError(
-            f"algorithm {name!r} is registered by no module imported so far{near(name, ALGORITHMS)}"
+            f"algorithm {name!r} is registered by no module imported so far; {near(name, ALGORITHMS)}"
         )
     return ALGORITHMS[name](agent, scenes, all_settings)
 
@@ -84,7 +83,7 @@ def make_loss_terms(agent: Agent, coefficients: Mapping[str, float]) -> list[Los
     for name, coefficient in coefficients.items():
         if name not in LOSS_TERMS:
             raise ConfigError(
-                f"objective.terms.{name} is registered by no module imported so far{near(name, LOSS_TERMS)}"
+                f"objective.terms.{name} is registered by no module imported so far; {near(name, LOSS_TERMS)}"
             )
         if not coefficient:
             continue

@@ -33,8 +33,8 @@ import vusfa.algorithms  # noqa: F401  (registers those of this package)
 from vusfa.cli.resume import resumed_settings
 from vusfa.conf import FOLDER
 from vusfa.conf import compose as conf_compose
-from vusfa.conf.schema import check_overrides, mistake, near, register_schema, validated
-from vusfa.errors import ResultError, VusfaError, WorkerError
+from vusfa.conf.schema import check_overrides, mistake, register_schema, unknown_setting, validated
+from vusfa.errors import ResultError, VusfaError, WorkerError, near
 from vusfa.files import say, use_own_temporary_folder
 from vusfa.modules.config import resolve_config
 from vusfa.training.folder import AUTO, found_checkpoint
@@ -117,13 +117,13 @@ def explain(error: Exception, folder: Path) -> str:
     if isinstance(error, MissingConfigException) and "Available options" in str(error):
         group, _, choice = (error.missing_cfg_file or "").rpartition("/")
         options = sorted(option.strip() for option in error.options or ())
-        return f"{group}={choice}: there is no such choice{near(choice, options)}"
+        return f"{group}={choice}: there is no such choice; {near(choice, options)}"
     GlobalHydra.instance().clear()
     unknown = re.match(r"Could not override '([^']+)'", text)
     if unknown:
         groups = [entry.name for entry in folder.iterdir() if entry.is_dir()]
         names = [*conf_compose.default_settings(), *groups, "algorithm"]
-        return f"no setting is called {unknown[1]!r}{near(unknown[1], names)}"
+        return unknown_setting(unknown[1], names)
     return mistake(error) or text
 
 

@@ -5,7 +5,6 @@ Needs Hydra (extra ``recipes``).
 
 from __future__ import annotations
 
-import difflib
 import types
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import fields, is_dataclass
@@ -18,10 +17,10 @@ from omegaconf.errors import ConfigKeyError, OmegaConfBaseException, ValidationE
 
 from vusfa.conf.compose import default_settings
 from vusfa.conf.settings import ALGORITHMS, LOSS_TERMS, POSITIVE, ObjectiveSettings, Settings, flat
-from vusfa.errors import ConfigError
+from vusfa.errors import ConfigError, near
 from vusfa.limits import brief
 
-__all__ = ["check_overrides", "mistake", "near", "register_schema", "schema", "validated"]
+__all__ = ["check_overrides", "mistake", "register_schema", "schema", "unknown_setting", "validated"]
 
 _WORDS = {bool: "true or false", int: "a whole number", float: "a number", str: "text"}
 _EXAMPLES = {"scenes": "[bathroom, kitchen]"}
@@ -84,12 +83,12 @@ def validated(settings: Mapping[str, Any], where: str = "") -> dict[str, Any]:
         groups = {field.name for field in fields(Settings)}
         for setting in flat(plain):
             if setting.partition(".")[0] not in groups:
-                raise ConfigError(f"no setting is called {setting!r}{near(setting, _names())}")
+                raise ConfigError(unknown_setting(setting))
         known = schema()
         name = plain.get("algorithm", {}).get("name") if isinstance(plain.get("algorithm"), dict) else None
         if name not in ALGORITHMS:
             raise ConfigError(
-                f"algorithm.name is {name!r}: no such algorithm is registered{near(str(name), ALGORITHMS)}"
+                f"algorithm.name is {name!r}: no such algorithm is registered; {near(name, ALGORITHMS)}"
             )
         known.algorithm = OmegaConf.structured(ALGORITHMS[name])
         merged = OmegaConf.merge(known, plain)
@@ -110,7 +109,7 @@ def mistake(error: BaseException) -> str | None:
     while error is not None:
         key = getattr(error, "full_key", None)
         if isinstance(error, ConfigKeyError) or type(error).__name__ == "ConfigAttributeError":
-            return f"no setting is called {key!r}{near(str(key), _names())}"
+            return unknown_setting(str(key))
         if isinstance(error, ValidationError) and key:
             return _wrong_value(key, error.value)
         if type(error).__name__ == "ConfigTypeError" and "deletion" in str(error):
@@ -121,17 +120,13 @@ def mistake(error: BaseException) -> str | None:
     return None
 
 
-def near(word: str, choices: Iterable[str]) -> str:
-    """The end of a sentence on an unknown word: the choice that comes near, or all of a few.
+def unknown_setting(name: str, names: Iterable[str] | None = None) -> str:
+    """The words for a setting that there is none of.
 
-    >>> near("optm", ["optim", "env"])
-    "; did you mean 'optim'?"
+    >>> unknown_setting("sed")
+    "no setting is called 'sed'; did you mean 'seed'?"
     """
-    choices = list(choices)
-    found = difflib.get_close_matches(word, choices, n=1, cutoff=0.5)
-    if found:
-        return f"; did you mean {found[0]!r}?"
-    return f"; there are {', '.join(choices)}" if len(choices) <= 12 else "; --help lists all settings"
+    return f"no setting is called {name!r}; {near(name, names or _names(), '--help lists all settings')}"
 
 
 def _check_data(plain: Any, prefix: str = "") -> None:

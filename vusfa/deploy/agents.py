@@ -7,7 +7,6 @@ Opening one runs no code.
 
 from __future__ import annotations
 
-import difflib
 import json
 import math
 import os
@@ -20,7 +19,7 @@ import torch
 from torch import Tensor
 
 from vusfa import __version__
-from vusfa.errors import CheckpointError, ConfigError
+from vusfa.errors import CheckpointError, ConfigError, near
 from vusfa.files import replacing
 from vusfa.limits import brief
 from vusfa.modules import Agent
@@ -83,9 +82,7 @@ def check_name(name: str) -> str:
     """
     names = pretrained_names()
     if name not in names:
-        near = difflib.get_close_matches(str(name), names, 1)
-        said = f"did you mean {near[0]!r}?" if near else f"there are {', '.join(names)}"
-        raise ConfigError(f"no pretrained agent is called {brief(name)}; {said}")
+        raise ConfigError(f"no pretrained agent is called {brief(name)}; {near(name, names)}")
     return name
 
 

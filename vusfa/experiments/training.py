@@ -28,6 +28,7 @@ from vusfa.training import (
 )
 from vusfa.training.folder import AUTO, CHECKPOINT, found_checkpoint
 from vusfa.training.precision import describe_autocast
+from vusfa.training.scene_files import settings_seen_from
 from vusfa.training.setup import decide_autocast
 
 __all__ = ["Trained", "compose_settings", "train"]
@@ -85,7 +86,7 @@ def train(settings: Mapping[str, Any], overrides: Sequence[str] = ()) -> Trained
         loggers = stack.enter_context(
             make_loggers(
                 folder=folder.path,
-                config=plain,
+                config=settings_seen_from(folder.path, plain),
                 run_id=trainer.run_id,
                 resume_frames=trainer.frames if plain["resume"] else None,
                 **plain["logger"],

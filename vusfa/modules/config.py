@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
-import difflib
 from collections.abc import Callable, Iterable
 from typing import Any, Literal, NamedTuple
 
-from vusfa.errors import ConfigError
+from vusfa.errors import ConfigError, near
 
 __all__ = ["ARCHITECTURES", "MODELS", "AgentConfig", "Model", "register_model", "resolve_config"]
 
@@ -178,7 +177,7 @@ def resolve_config(model: str, architecture: str = "controlled", **overrides: An
     fields = [field.name for field in dataclasses.fields(AgentConfig)][2:]
     for name in overrides:
         if name not in fields:
-            raise ConfigError(f"make_agent knows no field {name!r}; {_near(name, fields)}")
+            raise ConfigError(f"make_agent knows no field {name!r}; {near(name, fields)}")
     settings = {**ARCHITECTURES[architecture]["*"], **ARCHITECTURES[architecture].get(model, {})}
     if architecture != "controlled":
         for name in _OURS_ALONE:
@@ -260,12 +259,4 @@ def _default(name: str) -> Any:
 
 def _check_choice(what: str, value: Any, choices: Iterable[Any]) -> None:
     if value not in choices:
-        raise ConfigError(f"{what} is {value!r}; {_near(value, choices)}")
-
-
-def _near(value: Any, choices: Iterable[Any]) -> str:
-    names = [str(choice) for choice in choices]
-    found = difflib.get_close_matches(str(value), names, n=3)
-    if found:
-        return f"did you mean {' or '.join(map(repr, found))}?"
-    return f"it must be one of {', '.join(map(repr, names))}"
+        raise ConfigError(f"{what} is {value!r}; {near(value, choices)}")

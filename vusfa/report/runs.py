@@ -22,6 +22,7 @@ from vusfa.limits import brief
 from vusfa.reading import check_fields, read_csv, read_json
 from vusfa.report.curve import read_metrics
 from vusfa.training import row_name
+from vusfa.training.scene_files import find_given
 
 __all__ = ["LoggedRun", "read_episodes", "read_run", "run_label", "split_name"]
 
@@ -111,7 +112,8 @@ class LoggedRun:
     def scenes(self) -> list[str]:
         """Names or files of the scenes of the training."""
         scenes = self.settings.get("scenes", [])
-        return [scenes] if isinstance(scenes, str) else [str(scene) for scene in scenes]
+        given = [scenes] if isinstance(scenes, str) else [str(scene) for scene in scenes]
+        return [find_given(scene, self.folder / "checkpoint.pt") for scene in given]
 
 
 def _last(curves: Mapping[str, np.ndarray], name: str) -> float:

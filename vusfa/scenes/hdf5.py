@@ -25,8 +25,12 @@ __all__ = [
     "plain",
     "read_attributes",
     "read_distances",
+    "read_features",
     "replaced",
+    "row_blocks",
 ]
+
+_NUMBERS_AT_ONCE = 1 << 22
 
 
 @contextmanager
@@ -155,11 +159,30 @@ def read_distances(dataset: h5py.Dataset) -> np.ndarray:
     if not square or dataset.dtype.kind not in "iu" or dataset.dtype == np.int16:
         return np.asarray(dataset[()])
     table = np.empty(dataset.shape, np.int16)  # of at most limits.TABLE_STATES states
-    rows = dataset.chunks[0] if dataset.chunks else 1
-    rows *= max(1, (1 << 22) // (rows * dataset.shape[1]))
-    for first in range(0, len(table), rows):
-        table[first : first + rows] = np.clip(dataset[first : first + rows], -2, np.iinfo(np.int16).max)
+    for rows in row_blocks(dataset):
+        table[rows] = np.clip(dataset[rows], -2, np.iinfo(np.int16).max)
     return table
+
+
+def read_features(dataset: h5py.Dataset) -> np.ndarray:
+    """Features (N, C, F) in float32, some rows at a time: other programs write 2 or 8 bytes per number.
+
+    What is too large for float32 becomes infinite, which :mod:`vusfa.scenes.validation` finds.
+    """
+    if dataset.ndim != 3 or dataset.dtype.kind != "f" or dataset.dtype == np.float32:
+        return np.asarray(dataset[()])
+    features = np.empty(dataset.shape, np.float32)
+    with np.errstate(over="ignore"):
+        for rows in row_blocks(dataset):
+            features[rows] = dataset[rows]
+    return features
+
+
+def row_blocks(array: h5py.Dataset | np.ndarray) -> Iterator[slice]:
+    """Rows of an array, some at a time; of a dataset, whole chunks."""
+    chunk = array.chunks[0] if isinstance(array, h5py.Dataset) and array.chunks else 1
+    rows = chunk * max(1, _NUMBERS_AT_ONCE // max(1, chunk * math.prod(array.shape[1:])))
+    return (slice(first, first + rows) for first in range(0, len(array), rows))
 
 
 def copy_others(source: Path, target: h5py.File, known: Collection[str], stale: Collection[str] = ()) -> None:
@@ -206,9 +229,12 @@ def size_fault(dataset: h5py.Dataset) -> str | None:
     times = limits.MAX_PICTURE_COMPRESSION if dataset.ndim == 4 else limits.MAX_COMPRESSION
     if declared > max(limits.UNCOMPRESSED_BYTES, times * stored):
         return f"declares {declared} bytes, but {stored} are stored; at most {times} times that are read"
-    most = limits.MAX_EXTRA_BYTES
-    if dataset.ndim == 3 and declared > stored + most:
-        return f"declares {declared} bytes, but {stored} are stored; at most {most} more are read"
+    most, needed = limits.MAX_EXTRA_BYTES, 4 * math.prod(dataset.shape or ())
+    if dataset.ndim == 3 and needed > stored + most:
+        return (
+            f"needs {needed} bytes as float32, but {stored} are stored; at most {most} more are allowed:"
+            " store float32, or fewer crops"
+        )
     most = limits.MAX_CHUNK_BYTES
     if dataset.chunks and math.prod(dataset.chunks) * dataset.dtype.itemsize > most:
         return f"has chunks of shape {dataset.chunks}; at most {most} bytes per chunk are read"

@@ -23,6 +23,7 @@ from vusfa.errors import SceneError
 from vusfa.scenes.hdf5 import dataset_in, opened
 
 __all__ = [
+    "check",
     "check_scans",
     "decode",
     "look",
@@ -39,6 +40,8 @@ __all__ = [
 DATASETS = _RAW, _JPEG = "observation", "observation_jpeg"
 _AT_ONCE = 32
 _QUALITY = 92
+#: Last bytes of JPEG and PNG files.
+_ENDS = (b"\xff\xd9", b"IEND\xaeB`\x82")
 
 
 def _find(file: h5py.File) -> tuple[str, h5py.Dataset] | None:
@@ -79,6 +82,13 @@ def decode(encoded: bytes, shape: tuple[int, ...] | None = None) -> np.ndarray:
     Raises:
         OSError: it is no picture of these formats, damaged, larger than allowed, or of another shape.
     """
+    with _opened_within(encoded, shape) as image:
+        return np.asarray(image.convert("RGB"))
+
+
+@contextmanager
+def _opened_within(encoded: bytes, shape: tuple[int, ...] | None) -> Iterator[Image.Image]:
+    """A picture whose header is as :func:`decode` wants it; its content has not been looked at."""
     check_scans(encoded)
     with open_image(io.BytesIO(encoded)) as image:
         size = (image.height, image.width)
@@ -86,7 +96,7 @@ def decode(encoded: bytes, shape: tuple[int, ...] | None = None) -> np.ndarray:
             raise OSError(f"{image.width} x {image.height} pixels; at most {limits.MAX_PICTURE_SIDE} a side")
         if shape is not None and shape[:2] != size:
             raise OSError(f"{size} in size, and state 0 is {shape[:2]}")
-        return np.asarray(image.convert("RGB"))
+        yield image
 
 
 def to_jpeg(picture: np.ndarray) -> bytes:
@@ -158,18 +168,51 @@ def read_pictures(path: Path, ids: np.ndarray) -> np.ndarray:
             for row, state in enumerate(states.tolist()):
                 decoded[row] = decode(dataset[state].tobytes(), first.shape)
         except OSError as error:
-            raise SceneError(
-                f"{path}: dataset {_JPEG!r}, state {state}: is unusable ({error}); write it again"
-            ) from error
+            raise _unusable(path, state, error) from error
         return decoded[back]
 
 
-def raw_blocks(path: Path, num_states: int) -> Iterator[np.ndarray]:
-    """All pictures of a file in order, some (n, H, W, 3) at a time."""
-    size = read_pictures(path, np.arange(min(1, num_states))).nbytes
+def raw_blocks(path: Path, states: np.ndarray) -> Iterator[np.ndarray]:
+    """The pictures of the states (n,) in order, some (n, H, W, 3) at a time."""
+    size = read_pictures(path, states[:1]).nbytes
     at_once = max(1, min(_AT_ONCE, limits.MAX_PICTURE_BYTES // max(size, 1)))
-    for first in range(0, num_states, at_once):
-        yield read_pictures(path, np.arange(first, min(first + at_once, num_states)))
+    for first in range(0, len(states), at_once):
+        yield read_pictures(path, states[first : first + at_once])
+
+
+def check(path: Path, num_states: int, most: int | None = None) -> None:
+    """Check the pictures of a file: the header and the end of each, then what decoding finds.
+
+    What is cut off, of another size or no picture is thus found in seconds, in a file of any size.
+
+    Args:
+        path: the file.
+        num_states: N.
+        most: how many are decoded, evenly spaced; None for all.
+
+    Raises:
+        SceneError: naming the first picture that cannot be used.
+    """
+    with opened(path) as file:
+        name, dataset = _find(file) or ("", None)
+        if dataset is not None and name == _JPEG:
+            state = 0
+            try:
+                shape = decode(dataset[0].tobytes()).shape
+                for state in range(len(dataset)):
+                    encoded = dataset[state].tobytes()
+                    with _opened_within(encoded, shape) as image:
+                        if not encoded.rstrip(b"\0").endswith(_ENDS):  # cut off, or with something behind it
+                            image.load()
+            except OSError as error:
+                raise _unusable(path, state, error) from error
+    count = num_states if most is None else min(most, num_states)
+    for _ in raw_blocks(path, np.linspace(0, num_states - 1, count, dtype=np.int64)):
+        pass
+
+
+def _unusable(path: Path, state: int, error: OSError) -> SceneError:
+    return SceneError(f"{path}: dataset {_JPEG!r}, state {state}: is unusable ({error}); write it again")
 
 
 def stored(path: Path, num_states: int) -> tuple[list[bytes] | None, Iterator[np.ndarray] | None]:
@@ -180,7 +223,7 @@ def stored(path: Path, num_states: int) -> tuple[list[bytes] | None, Iterator[np
             return None, None
         name, dataset = found
         if name == _RAW:
-            return None, raw_blocks(path, num_states)
+            return None, raw_blocks(path, np.arange(num_states))
         jpegs: list[bytes] = []
         left = path.stat().st_size
         for state in range(len(dataset)):

@@ -265,8 +265,8 @@ class SceneSet:
             for scene in self.scenes:
                 head = (scene.name, scene.actions, tuple(scene.graph.shape), tuple(scene.features.shape))
                 digest.update(repr(head).encode())
-                digest.update(scene.graph.numpy().astype("<i8").tobytes())
-                digest.update(scene.features.numpy().astype("<f4").tobytes())
+                digest.update(np.ascontiguousarray(scene.graph.numpy(), "<i8").data)
+                digest.update(np.ascontiguousarray(scene.features.numpy(), "<f4").data)
             self._fingerprint = digest.hexdigest()[:16]
         return self._fingerprint
 

@@ -34,7 +34,9 @@ from vusfa.scenes.hdf5 import (
     opened,
     read_attributes,
     read_distances,
+    read_features,
     replaced,
+    row_blocks,
 )
 from vusfa.scenes.validation import DATASETS, array_faults
 
@@ -118,7 +120,9 @@ def read(path: str | os.PathLike[str]) -> Dump:
                 dataset = dataset_in(file, name)
                 if dataset is None:
                     continue
-                if name != "shortest_path_distance":
+                if name == "resnet_feature":
+                    dump.arrays[name] = read_features(dataset)
+                elif name != "shortest_path_distance":
                     dump.arrays[name] = np.asarray(dataset[()])
                 elif dataset.shape[:1] <= (TABLE_STATES,):
                     dump.arrays[name] = read_distances(dataset)
@@ -137,10 +141,15 @@ def read(path: str | os.PathLike[str]) -> Dump:
     return dump
 
 
-def validate(path: str | os.PathLike[str]) -> list[str]:
-    """All faults of a scene file at once, every picture decoded; an empty list for a sound file.
+def validate(path: str | os.PathLike[str], most_pictures: int | None = None) -> list[str]:
+    """All faults of a scene file at once; an empty list for a sound file.
 
     Each line names the file, the dataset, the state and the mend.
+
+    Args:
+        path: the file.
+        most_pictures: how many pictures are decoded, evenly spaced; None for every one. The header and the
+            end of every picture are looked at first.
 
     >>> validate(bundled_path("bathroom"))
     []
@@ -155,25 +164,33 @@ def validate(path: str | os.PathLike[str]) -> list[str]:
     faults = [f"{path}: {fault}" for fault in dump.faults()]
     if dump.picture_shape is not None and "graph" in dump.arrays and dump.arrays["graph"].ndim:
         try:
-            for _ in picture_files.raw_blocks(path, len(dump.arrays["graph"])):
-                pass
+            picture_files.check(path, len(dump.arrays["graph"]), most_pictures)
         except SceneError as error:
             faults.append(str(error))
     return faults
 
 
-def _smallest_integer(values: np.ndarray) -> np.ndarray:
-    for dtype in (np.int16, np.int32):
-        if values.min() >= np.iinfo(dtype).min and values.max() <= np.iinfo(dtype).max:
-            return values.astype(dtype)
-    return values.astype(np.int64)
+def _smallest_integer(values: np.ndarray) -> np.dtype:
+    return next(
+        np.dtype(kind)
+        for kind in (np.int16, np.int32, np.int64)
+        if values.min() >= np.iinfo(kind).min and values.max() <= np.iinfo(kind).max
+    )
 
 
-def _smallest_float(values: np.ndarray) -> np.ndarray:
+def _smallest_float(values: np.ndarray) -> np.dtype:
     """float16 where that holds every value exactly, else float32: what is read back is what was given."""
     with np.errstate(over="ignore"):
-        half = values.astype(np.float16)
-    return half if np.array_equal(half.astype(np.float32), values) else values.astype(np.float32)
+        exact = all((values[rows].astype(np.float16) == values[rows]).all() for rows in row_blocks(values))
+    return np.dtype(np.float16 if exact else np.float32)
+
+
+def _write_rows(file: h5py.File, name: str, values: np.ndarray, kind: np.dtype) -> None:
+    written = file.create_dataset(
+        name, values.shape, kind, compression="gzip", compression_opts=9, shuffle=True, fletcher32=True
+    )
+    for rows in row_blocks(written):
+        written[rows] = values[rows].astype(kind)
 
 
 def _write_attributes(file: h5py.File, attributes: Mapping[str, Any]) -> None:
@@ -223,10 +240,10 @@ def write(
     """
     path = Path(path)
     num_states = len(arrays["graph"])
+    kinds = {"resnet_feature": _smallest_float(arrays["resnet_feature"])}
+    kinds |= {key: np.dtype(np.float32) for key in ("location", "rotation")}
     integers = ("graph", "shortest_path_distance")
-    packed = {key: _smallest_integer(arrays[key]) for key in integers if key in arrays}
-    packed["resnet_feature"] = _smallest_float(arrays["resnet_feature"])
-    packed |= {key: np.asarray(arrays[key], dtype=np.float32) for key in ("location", "rotation")}
+    kinds |= {key: _smallest_integer(arrays[key]) for key in integers if key in arrays}
     raw: Iterable[np.ndarray] | None = None
     if pictures is None and source is not None:
         pictures, raw = picture_files.stored(source, num_states)
@@ -240,10 +257,8 @@ def write(
         raise SceneError(f"{path}: {len(pictures)} pictures for {num_states} states; give one for each")
     with replaced(path) as file:
         _write_attributes(file, {**attributes, "scene": name, "actions": list(actions)})
-        for key in (name for name in DATASETS if name in packed):
-            file.create_dataset(
-                key, data=packed[key], compression="gzip", compression_opts=9, shuffle=True, fletcher32=True
-            )
+        for key in (name for name in DATASETS if name in kinds):
+            _write_rows(file, key, arrays[key], kinds[key])
         if raw is not None:
             picture_files.write_raw(file, raw, num_states)
         elif pictures is not None:

@@ -16,6 +16,7 @@ import numpy as np
 from vusfa.errors import SceneError
 from vusfa.limits import MAX_FAULTS, TABLE_STATES
 from vusfa.scenes.graph import shortest_path_distances
+from vusfa.scenes.hdf5 import row_blocks
 
 if TYPE_CHECKING:
     from vusfa.scenes.scene import Scene
@@ -116,11 +117,13 @@ def feature_faults(features: np.ndarray) -> list[str]:
     ["dataset 'resnet_feature', state 1: crop 0, feature 0 is nan; compute the features of this state again"]
     """
     # A float64 beyond float32's range would become infinite when it is loaded.
-    wrong = ~(np.abs(features) <= np.finfo(np.float32).max)
-    if not wrong.any():
+    most = np.finfo(np.float32).max
+    wrong = [~(np.abs(features[rows]) <= most).all(axis=(1, 2)) for rows in row_blocks(features)]
+    states = np.flatnonzero(np.concatenate(wrong))
+    if not len(states):
         return []
-    state, crop, feature = (int(i) for i in np.argwhere(wrong)[0])
-    count = int(wrong.any(axis=(1, 2)).sum())
+    state, count = int(states[0]), len(states)
+    crop, feature = (int(i) for i in np.argwhere(~(np.abs(features[state]) <= most))[0])
     return [
         f"dataset 'resnet_feature', state {state}{_how_many(count)}: crop {crop}, feature {feature} is"
         f" {features[state, crop, feature]}; compute the features of this state again"

@@ -29,21 +29,22 @@ def compact(source: str | os.PathLike[str], target: str | os.PathLike[str]) -> N
     source = Path(source)
     dump = store.read(source)
     raise_faults(source, dump.faults())
-    with np.errstate(over="ignore"):
-        half = dump.arrays["resnet_feature"].astype(np.float16)
-    if not np.isfinite(half).all():
-        state = int(np.argwhere(~np.isfinite(half))[0][0])
-        raise SceneError(
-            f"{source}: dataset 'resnet_feature', state {state}: a value is beyond float16's range of"
-            f" +-65504; scale the features down"
-        )
+    features = dump.arrays["resnet_feature"]
+    for state, row in enumerate(features):
+        with np.errstate(over="ignore"):
+            features[state] = row.astype(np.float16)
+        if not np.isfinite(features[state]).all():
+            raise SceneError(
+                f"{source}: dataset 'resnet_feature', state {state}: a value is beyond float16's range of"
+                f" +-65504; scale the features down"
+            )
     num_states, num_actions = dump.arrays["graph"].shape
     pictures, blocks = picture_files.stored(source, num_states)
     if blocks is not None:
         pictures = [picture_files.to_jpeg(picture) for block in blocks for picture in block]
     store.write(
         target,
-        {**dump.arrays, "resnet_feature": half.astype(np.float32)},
+        dump.arrays,
         name=dump.name,
         actions=dump.actions or default_actions(num_actions),
         attributes=dump.attributes,

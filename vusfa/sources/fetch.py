@@ -18,7 +18,7 @@ from pathlib import Path, PurePosixPath
 from typing import IO, Any
 
 from vusfa.errors import ConfigError, SceneError
-from vusfa.limits import MAX_STATE_BYTES, brief
+from vusfa.limits import MAX_DECODED_PICTURES, MAX_STATE_BYTES, brief
 from vusfa.reading import BoundedZip, read_yaml
 from vusfa.scenes import store
 from vusfa.scenes.hdf5 import opened
@@ -96,7 +96,7 @@ def _archive(where: str, name: str, entry: dict[str, Any]) -> Archive:
 
 def arrived_faults(path: Path, num_states: int) -> list[str]:
     """What is wrong with a scene file that should have so many states; an empty list for a sound one."""
-    faults = store.validate(path)
+    faults = store.validate(path, MAX_DECODED_PICTURES)  # damage on the way shows in the archive's CRC
     if not faults:
         with opened(path) as file:
             found = len(file["graph"])

@@ -43,7 +43,7 @@ from vusfa.limits import brief
 from vusfa.modules import Agent, make_agent
 from vusfa.scenes import SceneSet
 from vusfa.training.content import check_entries, check_like, mended, read_content
-from vusfa.training.scene_files import find_source
+from vusfa.training.scene_files import find_given, find_source, with_goals
 from vusfa.training.upgrade import upgrade
 
 __all__ = [
@@ -65,8 +65,8 @@ __all__ = [
 FORMAT = 2
 # entries of Agent.config that describe the scenes, not the agent
 _OF_SCENES = ("scenes", "fingerprint", "num_actions")
-# settings whose other wording changes nothing: scenes are told apart by their content
-_REWORDED = ("resume", "scenes", "folder", "overwrite", "name")
+# settings whose other wording changes nothing: scenes and goals are compared by their content
+_REWORDED = ("resume", "scenes", "folder", "overwrite", "name", "env.goals")
 
 
 def save_checkpoint(path: str | Path, state: Mapping[str, Any]) -> Path:
@@ -129,6 +129,7 @@ def load_checkpoint(path: str | Path, device: torch.device | str = "cpu") -> dic
         )
     check_entries(path, state)
     state["scenes"]["sources"] = [find_source(source, path) for source in state["scenes"]["sources"]]
+    state["config"] = with_goals(state["config"], lambda source: find_given(source, path))
     return state
 
 

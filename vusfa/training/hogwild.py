@@ -31,7 +31,7 @@ from vusfa.errors import ConfigError, WorkerError
 from vusfa.objectives import TFRMSprop
 from vusfa.training.collectors import MakeEnv, make_collector, rows_per_worker
 from vusfa.training.trainer import Trainer
-from vusfa.training.workers import begin_worker, end_of
+from vusfa.training.workers import Silence, begin_worker, end_of
 
 __all__ = ["HogwildTrainer"]
 
@@ -79,6 +79,9 @@ class HogwildTrainer(Trainer):
         try:
             self._collector = workers
             yield iter(workers)
+        except WorkerError:
+            workers.patience = 0.0  # one that is stopped would not end, nor those that wait for its lock
+            raise
         finally:
             self._collector = None
             workers.close()
@@ -93,7 +96,7 @@ class HogwildTrainer(Trainer):
             no frames, and the numbers to log.
 
         Raises:
-            WorkerError: a worker has died.
+            WorkerError: a worker has died, or has been silent for too long.
         """
         began = time.monotonic()
         frames, episodes, terms = next(batches)
@@ -111,13 +114,15 @@ class HogwildTrainer(Trainer):
 class _Workers:
     """Processes that train, and their reports."""
 
+    patience = PATIENCE
+
     def __init__(self, trainer: HogwildTrainer) -> None:
         settings = trainer.settings
         # as TorchRL's collectors; a forked process would share more than the weights
         method = multiprocessing.get_start_method(allow_none=True) or "spawn"
         context: Any = multiprocessing.get_context(method)
         self.ended, self.frames = context.Event(), context.Value("q", trainer.frames)
-        self.limit = settings["collector"].get("timeout")
+        limit = settings["collector"].get("timeout")
         names = ("scenes", "goals", "agent", "algorithm", "optimizer")  # pickled as one: they share tensors
         parts = {name: getattr(trainer, name) for name in names}
         self.procs: list[Any] = []
@@ -135,23 +140,22 @@ class _Workers:
         except BaseException:
             self.close()
             raise
+        self.silence = Silence(self.procs, limit)
 
     def __iter__(self) -> Iterator[Any]:
         open_: list[Any] = list(self.reports)
-        silent = 0
         while open_:
             ready: list[Any] = wait(open_, timeout=1.0)
-            silent = 0 if ready else silent + 1
-            if self.limit is not None and silent > self.limit:
-                raise WorkerError(
-                    f"no worker has reported an update for {self.limit:g} s (collector.timeout)"
-                )
+            for report in ready:
+                self.silence.ends(self.reports.index(report))
+            self.silence.check()
             for report in ready:
                 try:
                     yield _tensors(*report.recv())
                 except (EOFError, OSError):
                     open_.remove(report)
                     self._check(self.reports.index(report))
+                    self.silence.ends(self.reports.index(report), for_good=True)
 
     def _check(self, rank: int) -> None:
         process = self.procs[rank]
@@ -162,7 +166,7 @@ class _Workers:
     def close(self) -> None:
         """Ends the workers after their current update."""
         self.ended.set()
-        until = time.monotonic() + PATIENCE
+        until = time.monotonic() + self.patience
         while any(process.is_alive() for process in self.procs) and time.monotonic() < until:
             ready: list[Any] = wait(self.reports, timeout=0.1)
             for report in ready:  # a worker whose report nobody reads would not end

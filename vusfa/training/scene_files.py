@@ -1,19 +1,24 @@
-"""Where a checkpoint's scenes are, as seen from it: they are found again when both have moved."""
+"""Where the files that a run was given are, as seen from its folder: they are found again when both have
+moved, and its files tell no absolute path of their author's machine."""
 
 from __future__ import annotations
 
 import os
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from vusfa.scenes import bundled_names
 
-__all__ = ["PLACES", "find_source", "scene_sources", "without_places"]
-
-#: Settings that say where something is, and that a resumed run does not take from its checkpoint.
-PLACES = ("scenes", "folder", "resume")
+__all__ = [
+    "find_given",
+    "find_source",
+    "scene_sources",
+    "settings_seen_from",
+    "with_goals",
+    "without_places",
+]
 
 
 def scene_sources(scenes: str | Sequence[str], folder: str | Path) -> list[str]:
@@ -37,6 +42,35 @@ def find_source(source: str, checkpoint: Path) -> str:
     place = Path(os.path.normpath(folder / source))
     beside = folder / place.name
     return str(beside if beside.is_file() and not place.exists() else place)
+
+
+def find_given(source: str, checkpoint: Path) -> str:
+    """As :func:`find_source`; what is not there stays as it is, as version 0.1 wrote it."""
+    found = find_source(source, checkpoint)
+    return found if Path(found).is_file() else source
+
+
+def settings_seen_from(folder: str | Path, settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Settings as files in a run's folder hold them: scenes and lists of goals as seen from there, of other
+    places the last part.
+
+    >>> given = {"scenes": "/x/hall.h5", "folder": "/x/runs/a", "env": {"goals": "/x/few.yaml"}}
+    >>> settings_seen_from("/x/runs/a", given)
+    {'scenes': ['../../hall.h5'], 'folder': '.../a', 'env': {'goals': '../../few.yaml'}}
+    """
+    seen = with_goals(settings, lambda path: scene_sources(path, folder)[0])
+    places = {name: without_places(settings[name]) for name in ("folder", "resume") if name in settings}
+    return {**seen, **places, "scenes": scene_sources(settings["scenes"], folder)}
+
+
+def with_goals(settings: Mapping[str, Any], change: Callable[[str], str]) -> dict[str, Any]:
+    """Settings whose paths of lists of goals (``env.goals``, ``evaluation.goals``) are changed."""
+    changed = dict(settings)
+    for group in ("env", "evaluation"):
+        goals = settings[group].get("goals") if isinstance(settings.get(group), Mapping) else None
+        if isinstance(goals, str) and Path(goals).suffix in (".yaml", ".yml"):
+            changed[group] = {**settings[group], "goals": change(goals)}
+    return changed
 
 
 def without_places(value: Any) -> Any:

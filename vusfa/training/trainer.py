@@ -39,7 +39,7 @@ from vusfa.training.metrics import EpisodeMeter, MeanMeter
 from vusfa.training.optimization import descend, total_loss
 from vusfa.training.precision import resolve_autocast
 from vusfa.training.random_state import check_random_state, random_state, restore_random_state
-from vusfa.training.scene_files import PLACES, scene_sources, without_places
+from vusfa.training.scene_files import scene_sources, settings_seen_from, without_places
 from vusfa.training.workers import supervised
 
 __all__ = ["Trainer"]
@@ -205,7 +205,7 @@ class Trainer:
                     "fingerprint": self.scenes.fingerprint,
                 },
                 "goals": self.goals.cpu(),
-                "config": {**self.settings, **{name: without_places(self.settings[name]) for name in PLACES}},
+                "config": settings_seen_from(Path(path).parent, self.settings),
                 "overrides": without_places(list(self.overrides)),
                 "agent_config": self.agent.config,
                 "agent": self.agent.state_dict(),

@@ -4,6 +4,7 @@ that names it; none outlives the training."""
 from __future__ import annotations
 
 import ctypes
+import math
 import multiprocessing
 import os
 import queue
@@ -22,7 +23,7 @@ from torchrl.collectors import BaseCollector
 
 from vusfa.errors import VusfaError, WorkerError
 
-__all__ = ["begin_worker", "end_of", "started", "supervised", "watch"]
+__all__ = ["Silence", "begin_worker", "end_of", "started", "supervised", "watch"]
 
 #: What one wait, or one update between two waits, counts at most towards a time limit, in seconds: a
 #: training that was suspended (Ctrl-Z, a laptop's lid) does not hold that against its workers.
@@ -132,13 +133,41 @@ def supervised(collector: BaseCollector) -> Iterator[None]:
         raise WorkerError(dead) from error
 
 
+class Silence:
+    """How long each worker has sent nothing.
+
+    Args:
+        workers: their processes.
+        limit: seconds after which a silent one counts as dead; None: any time.
+    """
+
+    def __init__(self, workers: Sequence[Any], limit: float | None) -> None:
+        self._workers, self._limit = workers, limit
+        self._clock, self._last = 0.0, time.monotonic()
+        self._heard = [0.0] * len(workers)
+
+    def ends(self, index: int, *, for_good: bool = False) -> None:
+        """A worker has sent something, or will send no more."""
+        self._heard[index] = math.inf if for_good else self._clock
+
+    def check(self) -> None:
+        """Raise a WorkerError that names the workers which have been silent for too long."""
+        now = time.monotonic()
+        self._clock += min(now - self._last, LONGEST_WAIT)
+        self._last = now
+        silent = [i for i, heard in enumerate(self._heard) if self._clock - heard > (self._limit or math.inf)]
+        if silent:
+            named = ", ".join(f"{index} (process {self._workers[index].pid})" for index in silent)
+            raise WorkerError(
+                f"worker {named} of the collector has sent nothing for {self._limit:g} s (collector.timeout)"
+            )
+
+
 class _WatchedQueue:
     """The queue on which workers announce their batches."""
 
     def __init__(self, results: Any, workers: Sequence[Any], limit: float | None) -> None:
-        self._results, self._workers, self._limit = results, workers, limit
-        self._clock, self._last = 0.0, time.monotonic()
-        self._heard = [0.0] * len(workers)
+        self._results, self._workers, self._silence = results, workers, Silence(workers, limit)
 
     def get(self, timeout: float | None = None) -> Any:
         """As a queue's ``get``.
@@ -153,22 +182,14 @@ class _WatchedQueue:
             raise
         announced = item[0][1] if isinstance(item[0], tuple) else item[0]
         self._look()
-        self._heard[announced] = self._clock
+        self._silence.ends(announced)
         return item
 
     def _look(self) -> None:
-        now = time.monotonic()
-        self._clock += min(now - self._last, LONGEST_WAIT)
-        self._last = now
         dead = _dead(self._workers)
         if dead:
             raise WorkerError(dead)
-        silent = [i for i, heard in enumerate(self._heard) if self._clock - heard > (self._limit or 1e30)]
-        if silent:
-            named = ", ".join(f"{index} (process {self._workers[index].pid})" for index in silent)
-            raise WorkerError(
-                f"worker {named} of the collector has sent nothing for {self._limit:g} s (collector.timeout)"
-            )
+        self._silence.check()
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._results, name)
