@@ -264,6 +264,19 @@ def _closed(file: h5py.File, buffer: io.BytesIO) -> bytes:
 
 
 #: How a file is damaged within its format.
+def _safetensors(data: bytes, rng: random.Random) -> bytes:
+    """A value of the header, or of the JSON text that an agent's header holds, replaced."""
+    size = int.from_bytes(data[:8], "little")
+    header = json.loads(data[8 : 8 + size])
+    if rng.random() < 0.7:
+        inner = json.loads(header["__metadata__"]["vusfa"])
+        header["__metadata__"]["vusfa"] = json.dumps(_value(inner, rng))
+    else:
+        header = _value(header, rng)
+    text = json.dumps(header).encode()
+    return len(text).to_bytes(8, "little") + text + data[8 + size :]
+
+
 KINDS: dict[str, list[Callable[[bytes, random.Random], bytes]]] = {
     "bytes": [_bytes],
     "jpeg": [_bytes],
@@ -275,6 +288,7 @@ KINDS: dict[str, list[Callable[[bytes, random.Random], bytes]]] = {
     "npz": [_zip],
     "npy": [_npy],
     "hdf5": [_hdf5],
+    "safetensors": [_safetensors],
     "checkpoint": [_checkpoint, _checkpoint, _zip],
 }
 

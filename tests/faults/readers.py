@@ -20,6 +20,7 @@ from omegaconf import OmegaConf
 from PIL import Image
 
 from vusfa.cli.launch import compose
+from vusfa.deploy.agents import open_agent, save_agent
 from vusfa.envs import resolve_goals
 from vusfa.envs.goals import read_manifest as read_goals
 from vusfa.errors import SceneError
@@ -250,8 +251,14 @@ def _resume(path: Path) -> None:
         trainer.update(batches)
 
 
+def _agent_file(folder: Path) -> Path:
+    trainer = _trainer()
+    return save_agent(folder / "agent.safetensors", trainer.agent, _ROOMS, trainer.goals)
+
+
 READERS: dict[str, Reader] = {
     "checkpoint": Reader("checkpoint", _checkpoint, _resume),
+    "agent": Reader("safetensors", _agent_file, lambda path: open_agent(path, _ROOMS)),
     "scene": Reader("hdf5", _jpeg_scene, _read_scene),
     "scene, raw": Reader("hdf5", _raw_scene, _read_scene),
     "compact": Reader("hdf5", _jpeg_scene, _compact),

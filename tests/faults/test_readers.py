@@ -15,7 +15,7 @@ import pytest
 
 HERE = Path(__file__).parent
 NAMES = [
-    "checkpoint",
+    "checkpoint", "agent",
     "scene", "scene, raw", "compact", "fetch", "archives", "picture", "features", "poses", "edges", "row log",
     "plan", "goals", "goal names", "manifest", "cell.json", "episodes", "exact", "metrics.csv",
     "episodes.csv", "config.json", "zero_shot.json",

@@ -21,7 +21,7 @@ from torch import Tensor
 from vusfa import __version__
 from vusfa.errors import CheckpointError, ConfigError, near
 from vusfa.files import replacing
-from vusfa.limits import brief
+from vusfa.limits import MAX_JSON_BYTES, brief
 from vusfa.modules import Agent
 from vusfa.scenes import SceneSet, bundled_names
 from vusfa.scenes.store import bundled_path
@@ -198,19 +198,30 @@ def read_agent(path: str | os.PathLike[str], scenes: SceneSet | None = None) -> 
     library = import_module("safetensors") if _safetensors() else None
     try:
         with library.safe_open(path, framework="pt") as file:  # type: ignore[union-attr]
-            header = json.loads((file.metadata() or {})["vusfa"])
+            text = (file.metadata() or {})["vusfa"]
+            if len(text) > MAX_JSON_BYTES:
+                raise ValueError(f"its header has more than {MAX_JSON_BYTES} bytes")
+            header = json.loads(text)
             weights = {name: file.get_tensor(name).float() for name in file.keys()}
         _check_header(header)
         if not all(bool(value.isfinite().all()) for value in weights.values()):
             raise ValueError("its weights hold NaN or infinity")
-    except (library.SafetensorError, OSError, KeyError, ValueError, TypeError, RecursionError) as error:  # type: ignore[union-attr]
+        goals = torch.tensor(header["goals"], dtype=torch.int64)
+    except (
+        library.SafetensorError,
+        OSError,
+        LookupError,
+        ValueError,
+        TypeError,
+        RuntimeError,
+        OverflowError,
+    ) as error:  # type: ignore[union-attr]
         raise CheckpointError(
             f"{path}: no agent of vusfa ({brief(str(error))}); give a file of vusfa pretrained or push_to_hub"
         ) from error
     check_sizes(path, header["agent_config"], weights)
     if scenes is None:
         scenes = SceneSet.open([find_source(source, path) for source in header["scenes"]["sources"]])
-    goals = torch.tensor(header["goals"], dtype=torch.int64)
     agent = saved_agent(path, {**header, "agent": weights, "goals": goals}, scenes)
     return TrainedAgent(agent, scenes, goals)
 
