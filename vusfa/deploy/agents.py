@@ -45,6 +45,8 @@ __all__ = [
 #: Where the package keeps its pretrained agents, NAME.safetensors with its model card NAME.md.
 PRETRAINED = Path(__file__).parent / "pretrained"
 _HEADER = {"agent_config": dict, "scenes": dict, "goals": list}
+#: What the values of a damaged header raise.
+_DAMAGED = (ValueError, TypeError, RuntimeError, OverflowError)
 _SCENES = {"sources": list, "names": list, "fingerprint": str}
 
 
@@ -207,15 +209,7 @@ def read_agent(path: str | os.PathLike[str], scenes: SceneSet | None = None) -> 
         if not all(bool(value.isfinite().all()) for value in weights.values()):
             raise ValueError("its weights hold NaN or infinity")
         goals = torch.tensor(header["goals"], dtype=torch.int64)
-    except (
-        library.SafetensorError,
-        OSError,
-        LookupError,
-        ValueError,
-        TypeError,
-        RuntimeError,
-        OverflowError,
-    ) as error:  # type: ignore[union-attr]
+    except (library.SafetensorError, OSError, LookupError, *_DAMAGED) as error:  # type: ignore[union-attr]
         raise CheckpointError(
             f"{path}: no agent of vusfa ({brief(str(error))}); give a file of vusfa pretrained or push_to_hub"
         ) from error
