@@ -15,11 +15,12 @@ from vusfa.evaluation.baselines import RANDOM_WALK
 from vusfa.experiments.training import train
 from vusfa.report.curve import plot_curve
 from vusfa.report.film import draw_film, longest_success, record_walk, write_gif
+from vusfa.report.media import draw_media
 
 
 def demo(settings: dict[str, Any], overrides: list[str]) -> int:
     """Trains as recipes/train.py does; then the film and the curve."""
-    trainer, result, exit_code = train(settings, overrides)
+    trainer, result, exit_code = train(settings, overrides, draw_media)
     if result is None:
         return exit_code
     folder, agent, scenes = Path(trainer.settings["folder"]), trainer.agent.eval(), trainer.scenes

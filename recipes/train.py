@@ -1,7 +1,7 @@
 """Trains one of the four models: python recipes/train.py agent.model=vusfa scenes=[bathroom]
 
-Settings are in vusfa/conf/train.yaml and the folders beside it. The run's folder gets metrics.csv and
-checkpoint.pt, and at the end evaluation.csv, .json and evaluation_episodes.csv. To go on: python
+Settings are in vusfa/conf/train.yaml and the folders beside it. The run's folder gets metrics.csv,
+checkpoint.pt and best.pt, and at the end evaluation.csv, .json and evaluation_episodes.csv. To go on: python
 recipes/train.py resume=RUN/checkpoint.pt
 """
 
@@ -11,14 +11,12 @@ from typing import Any
 
 from vusfa.cli.launch import launch
 from vusfa.experiments.training import train
-from vusfa.files import say
+from vusfa.report.media import draw_media
 
 
 def main(settings: dict[str, Any], overrides: list[str]) -> int:
-    """Trains and evaluates, and says where the results are."""
-    trainer, _, exit_code = train(settings, overrides)
-    say(f"{trainer.settings['folder']}/checkpoint.pt")
-    return exit_code
+    """Train and evaluate."""
+    return train(settings, overrides, draw_media).exit_code
 
 
 if __name__ == "__main__":

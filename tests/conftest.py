@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 import itertools
+import json
 import os
 import signal
+import subprocess
+import sys
+import time
 import zlib
 from collections.abc import Callable, Iterator
 from importlib.util import find_spec
@@ -183,20 +187,18 @@ def fast_workers() -> Iterator[None]:
 
 
 @pytest.fixture
-def wandb_content() -> Callable[[Path], bytes]:
-    """What a .wandb file holds, joined where its 32 KB blocks cut it."""
+def wandb_records() -> Callable[[Path], list[dict[str, Any]]]:
+    """The records of an ended run's .wandb file or folder, as wandb's own reader gives them."""
 
-    def read(path: Path) -> bytes:
-        data, place, parts = path.read_bytes(), 7, []  # behind the file's head
-        while place + 7 <= len(data):
-            left = 32768 - place % 32768
-            if left < 7:  # padding: a record's head is not cut
-                place += left
-                continue
-            length = int.from_bytes(data[place + 4 : place + 6], "little")  # behind a checksum
-            parts.append(data[place + 7 : place + 7 + length])
-            place += 7 + length
-        return b"".join(parts)
+    def read(path: Path) -> list[dict[str, Any]]:
+        command = [sys.executable, "-m", "wandb", "leet", "inspect", "--json", str(path)]
+        deadline = time.monotonic() + 60.0  # wandb's service writes the file, on a busy machine seconds late
+        while True:
+            done = subprocess.run(command, capture_output=True, text=True, check=False)
+            records = [json.loads(line) for line in done.stdout.splitlines()]
+            if any(record["type"] == "exit" for record in records) or time.monotonic() > deadline:
+                assert records, done.stderr
+                return records
 
     return read
 

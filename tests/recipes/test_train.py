@@ -5,13 +5,13 @@ from __future__ import annotations
 import csv
 import json
 import math
-import time
 from pathlib import Path
 
 import pytest
 import torch
 
 from vusfa.evaluation import evaluate
+from vusfa.report.media import draw_media
 from vusfa.training import load_agent, load_checkpoint, make_observation
 
 MODELS = ("gvf", "usfa", "sfdp", "vusfa")
@@ -126,32 +126,37 @@ def test_options_train(recipe, settings, small, tmp_path: Path, options: list[st
 
 @pytest.mark.filterwarnings("default")  # TensorBoard and wandb themselves
 def test_all_loggers_hear_of_a_run(
-    recipe, settings, small, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, wandb_content
+    recipe, settings, small, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, wandb_records
 ):
     monkeypatch.setenv("WANDB_DATA_DIR", str(tmp_path / "data"))
     options = [
         "logger.kinds=[csv,tensorboard,wandb]",
         "logger.mode=offline",
+        "logger.tags=[small]",
+        "agent.history=1",
         "evaluation=trained",
+        "evaluation.interval=240",
         "evaluation.episodes_per_goal=2",
         "evaluation.max_steps=20",
         f"folder={tmp_path / 'run'}",
     ]
-    trainer, _, _ = recipe("train").train(settings(*small, *options), options)
-    (stored,) = (tmp_path / "run" / "wandb").glob(f"offline-run-*/run-{trainer.run_id}.wandb")
-    words = [
-        b"goal/hall/3/success",
-        b"scene/hall/length_ratio",
-        b"loss_critic",
-        b"evaluation",
-        b"checkpoint-",
-    ]
-    deadline = time.monotonic() + 60.0  # wandb's service writes the file, on a busy machine some seconds late
-    while (absent := [word for word in words if word not in wandb_content(stored)]) and (
-        time.monotonic() < deadline
-    ):
-        time.sleep(0.2)
-    assert absent == []
+    small.remove("agent.history=2")
+    trainer, _, _ = recipe("train").train(settings(*small, *options), options, draw_media)
+    records = wandb_records(next((tmp_path / "run" / "wandb").glob(f"offline-run-*-{trainer.run_id}")))
+    rows = [record["history"]["item"] for record in records if record["type"] == "history"]
+    *rows, last = rows
+    assert [row["frames"] for row in rows] == [row["_step"] for row in rows] == list(range(48, 481, 48))
+    assert (last["frames"], last["_step"], last["evaluation._type"]) == (480, 481, "table-file")
+    logged = {"train/loss_critic", "train/success", "goal/hall/3/length_ratio", "scene/hall/length_ratio"}
+    evaluated = {"eval/validation/spl", "scene/hall/eval/trained/success", "validation.nrows"}
+    evaluated |= {"eval/walk.path", "eval/floor/hall.path"}
+    assert logged <= set().union(*rows)
+    assert [row["frames"] for row in rows if evaluated <= row.keys()] == [240, 480]
+    assert not any(evaluated & row.keys() for row in rows if row["frames"] not in (240, 480))
+    aliases = [r["artifact"]["aliases"] for r in records if r.get("artifact", {}).get("type") == "model"]
+    assert aliases[0] == ["latest", "best"]
+    assert aliases[-1][0] == "latest"
+    assert (tmp_path / "run" / "best.pt").is_file()
     assert list((tmp_path / "run" / "tensorboard").glob("events*"))
 
 

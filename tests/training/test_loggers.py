@@ -3,18 +3,22 @@
 from __future__ import annotations
 
 import csv
+import io
 import json
 import math
-import os
 import time
 from pathlib import Path
+from typing import Any
 
 import pytest
+from PIL import Image
 
+from vusfa import __version__
 from vusfa.errors import ConfigError, ResultError
+from vusfa.report.film import encode_gif
 from vusfa.training import make_loggers
 from vusfa.training.loggers import CSVLogger, Loggers
-from vusfa.training.trackers import TensorBoardLogger, WandbLogger
+from vusfa.training.trackers import TensorBoardLogger, WandbLogger, sweep_run_id
 
 CONFIG = {"agent": {"model": "vusfa"}, "seed": 3}
 TABLE = [{"scene": "hall", "success": 0.5}, {"scene": "attic", "success": math.nan}]
@@ -90,6 +94,8 @@ def test_a_tracker_that_fails_is_left_behind(capsys: pytest.CaptureFixture[str])
     heard = []
 
     class Steady:
+        shows_media = False
+
         def log_metrics(self, metrics, frames: int) -> None:
             heard.append(frames)
 
@@ -107,55 +113,163 @@ def test_a_tracker_that_fails_is_left_behind(capsys: pytest.CaptureFixture[str])
     assert capsys.readouterr().err.count("warning: Full has failed ([Errno 28] No space left on device)") == 1
 
 
+def media() -> dict[str, bytes]:
+    """A film of two pictures, and a picture."""
+    pictures, still = [Image.new("RGB", (12, 8), color) for color in ("red", "blue")], io.BytesIO()
+    pictures[0].save(still, format="PNG")
+    return {"eval/walk": encode_gif(pictures), "eval/floor/hall": still.getvalue()}
+
+
 @pytest.mark.filterwarnings("default")  # TensorBoard's own imports warn
 def test_tensorboard(tmp_path: Path):
     log = TensorBoardLogger(tmp_path, CONFIG)
-    log.log_metrics({"goal/hall/3/success": 0.25, "loss": math.nan}, 10)
-    log.log_checkpoint(tmp_path / "checkpoint.pt", 10)
+    log.log_metrics({"goal/hall/3/success": 0.25, "loss": math.nan, "kl": 0.5}, 10)
+    log.log_checkpoint(tmp_path / "checkpoint.pt", 10, is_best=True)
     log.log_table("evaluation", TABLE, 10)
+    log.log_media(media(), 10)
     log.close()
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
     events = EventAccumulator(str(tmp_path))
     events.Reload()
-    assert events.Tags()["scalars"] == ["goal/hall/3/success"]
+    assert sorted(events.Tags()["scalars"]) == ["goal/hall/3/success", "train/kl"]
     assert [(e.step, e.value) for e in events.Scalars("goal/hall/3/success")] == [(10, 0.25)]
     texts = {
         tag: events.Tensors(tag)[0].tensor_proto.string_val[0].decode() for tag in events.Tags()["tensors"]
     }
     assert "| agent.model | vusfa |" in texts["config/text_summary"]
     assert "| hall | 0.5 |" in texts["evaluation/text_summary"]
-    assert texts["checkpoint/text_summary"].endswith("checkpoint.pt")
+    assert texts["checkpoint/text_summary"].endswith("checkpoint.pt (best so far)")
+    for name, data in media().items():
+        (image,) = events.Images(name)
+        assert (image.step, image.width, image.height) == (10, 12, 8)
+        assert image.encoded_image_string == data
 
 
-@pytest.mark.filterwarnings("default")  # wandb's own
-def test_wandb_offline(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, wandb_content):
+@pytest.fixture
+def wandb_at_home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """wandb keeps to the test's folder."""
     monkeypatch.setenv("HOME", str(tmp_path / "home"))
-    monkeypatch.delenv("WANDB_DATA_DIR", raising=False)
+    monkeypatch.setenv("WANDB_DATA_DIR", str(tmp_path / "data"))
+
+
+def history(records: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    return [record["history"]["item"] for record in records if record["type"] == "history"]
+
+
+@pytest.mark.usefixtures("wandb_at_home")
+@pytest.mark.filterwarnings("default")  # wandb's own
+def test_wandb_read_back(tmp_path: Path, wandb_records):
+    """A run that ended after its checkpoint, and the resumed one: two folders, one run, no frame twice."""
     checkpoint = tmp_path / "checkpoint.pt"
     checkpoint.write_bytes(b"weights")
-    log = WandbLogger(tmp_path / "run", CONFIG, run_id="abc12345", project="test", mode="offline")
+    given = {"run_id": "abc12345", "project": "test", "mode": "offline"}
+    given |= {"entity": "team", "group": "seeds", "tags": ["small", "hall"]}
+    log = WandbLogger(tmp_path / "run", CONFIG, **given)
     log.log_metrics({"success": 0.5, "loss": math.nan, "goal/hall/3/success": 0.25}, 10)
-    log.log_checkpoint(checkpoint, 10)
+    log.log_media(media(), 10)
     log.log_table("evaluation", TABLE, 10)
-    summary = dict(log.run.summary)
-    assert summary["success"] == 0.5
-    assert summary["goal/hall/3/success"] == 0.25
-    assert summary["frames"] == 10
-    assert "loss" not in summary
-    assert log.run.config["agent"] == {"model": "vusfa"}
-    assert log.run.id == "abc12345"
+    log.log_checkpoint(checkpoint, 10, is_best=True)
+    log.log_metrics({"success": 0.6}, 20)
+    log.close(exit_code=1)  # before another checkpoint
+    time.sleep(1.1 - time.time() % 1)  # a folder is called after its second
+    log = WandbLogger(tmp_path / "run", CONFIG, **given)
+    for frames in (20, 30):
+        log.log_metrics({"success": frames / 100}, frames)
+    checkpoint.write_bytes(b"other weights")
+    log.log_checkpoint(checkpoint, 30)
     log.close()
-    (stored,) = (tmp_path / "run" / "wandb").glob("offline-run-*/run-abc12345.wandb")
-    words = (b"checkpoint-abc12345", b"evaluation", b"goal/hall/3/success")
-    # wandb's service writes the file, in a process of its own, and on a busy machine some seconds late
-    deadline = time.monotonic() + 60.0
-    while not all(word in stored.read_bytes() for word in words) and time.monotonic() < deadline:
-        time.sleep(0.2)
-    content = wandb_content(stored)
-    assert [word for word in words if word not in content] == []
-    monkeypatch.delenv("WANDB_DATA_DIR", raising=False)
-    os.environ.pop("WANDB_DATA_DIR", None)
+
+    first, second = (
+        wandb_records(path) for path in sorted((tmp_path / "run" / "wandb").glob("offline-run-*"))
+    )
+    (run,) = (record["run"] for record in first if record["type"] == "run")
+    assert (run["run_id"], run["project"], run["entity"]) == ("abc12345", "test", "team")
+    assert (run["run_group"], sorted(run["tags"]), run["resume"]) == ("seeds", ["hall", "small"], True)
+    config = run["config"]["update"]
+    assert (config["agent"], config["seed"]) == ({"model": "vusfa"}, 3)
+    assert config["versions"]["vusfa"] == __version__
+    axes = [record["metric"] for record in first if record["type"] == "metric"]
+    assert {axis.get("step_metric") for axis in axes if axis.get("glob_name") == "*"} == {"frames"}
+    (row,) = history(first)
+    assert (row["frames"], row["_step"], row["train/success"], row["goal/hall/3/success"]) == (
+        10,
+        10,
+        0.5,
+        0.25,
+    )
+    assert "train/loss" not in row
+    assert row["eval/walk._type"] == "video-file"
+    assert row["eval/floor/hall._type"] == "image-file"
+    assert row["evaluation.nrows"] == 2
+    assert [(row["frames"], row["_step"]) for row in history(second)] == [(20, 20), (30, 30)]
+    assert {record["run"]["run_id"] for record in second if record["type"] == "run"} == {"abc12345"}
+    aliases = [
+        record["artifact"]["aliases"]
+        for record in [*first, *second]
+        if record["type"] == "artifact" and record["artifact"]["type"] == "model"
+    ]
+    assert aliases == [["latest", "best"], ["latest"]]
+
+
+@pytest.mark.usefixtures("wandb_at_home")
+def test_wandb_sends_or_leaves_out_what_it_should(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Rows of a run without a checkpoint; online, those that W&B does not have; a table at the end."""
+    sent: list[tuple[Any, int]] = []
+
+    class Run:
+        id, offline, starting_step = "a", True, 0
+
+        def log(self, row: dict[str, Any], step: int, commit: bool) -> None:
+            sent.append((row["frames"], step))
+
+        def finish(self, exit_code: int) -> None:
+            pass
+
+        log_artifact = define_metric = lambda *_, **__: None
+
+    run = Run()
+    monkeypatch.setattr("wandb.init", lambda **_: run)
+
+    def rows(**facts: Any) -> WandbLogger:
+        vars(run).update(facts)
+        sent.clear()
+        log = WandbLogger(tmp_path, CONFIG, run_id="a")
+        for frames in (10, 20):
+            log.log_metrics({"success": 0.5}, frames)
+        return log
+
+    log = rows()
+    assert sent == []
+    log.close(exit_code=1)
+    assert sent == [(10, 10), (20, 20)]
+    log = rows()
+    log.log_checkpoint(Path(__file__), 20)
+    log.log_metrics({"success": 0.5}, 30)
+    log.close(exit_code=1)
+    assert sent == [(10, 10), (20, 20)]
+    log = rows(offline=False, starting_step=11)
+    assert sent == [(20, 20)]
+    log.log_table("evaluation", TABLE, 20)
+    log.close()
+    assert sent == [(20, 20), (20, 21)]
+
+
+@pytest.mark.usefixtures("wandb_at_home")
+@pytest.mark.filterwarnings("default")
+def test_wandb_disabled_does_nothing(tmp_path: Path):
+    log = WandbLogger(tmp_path / "other", CONFIG, run_id="abc12346", mode="disabled")
+    log.log_metrics({"success": 0.5}, 10)
+    log.log_media(media(), 10)
+    log.close()
+
+
+def test_a_sweeps_run_has_the_id_of_its_agent(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.delenv("WANDB_SWEEP_ID", raising=False)
+    monkeypatch.setenv("WANDB_RUN_ID", "abc")
+    assert sweep_run_id() is None
+    monkeypatch.setenv("WANDB_SWEEP_ID", "sweep")
+    assert sweep_run_id() == "abc"
 
 
 def test_an_unknown_logger_is_named(tmp_path: Path):
@@ -174,6 +288,8 @@ def test_an_exception_closes_loggers_with_a_failure():
     codes = []
 
     class Recorder:
+        shows_media = False
+
         def close(self, exit_code: int = 0) -> None:
             codes.append(exit_code)
 

@@ -38,7 +38,7 @@ class Deaf:
         if self.left == 0:
             self.act(self.trainer)
 
-    def rates(self, *_: float) -> None:
+    def rates(self, *_: Any, **__: Any) -> None:
         pass
 
     log_metrics = log_checkpoint = rates

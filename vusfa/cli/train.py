@@ -7,8 +7,6 @@ from typing import Any
 
 import typer
 
-from vusfa.files import say
-
 __all__ = ["register"]
 
 #: Hydra reads everything behind ``train`` itself, ``--help`` included.
@@ -39,6 +37,7 @@ def train(context: typer.Context) -> None:
     try:
         from vusfa.cli.launch import launch
         from vusfa.experiments import training
+        from vusfa.report.media import draw_media
     except ModuleNotFoundError as error:
         typer.echo(f"error: vusfa train needs {error.name}: pip install 'vusfa[recipes]'", err=True)
         raise typer.Exit(1) from error
@@ -51,11 +50,7 @@ def train(context: typer.Context) -> None:
             raise typer.Exit(2)
 
     def job(settings: dict[str, Any], overrides: list[str]) -> int:
-        trainer, _, exit_code = training.train(settings, overrides)
-        folder = trainer.settings["folder"]
-        say(f"next: vusfa report {folder}, vusfa film {folder}, vusfa evaluate {folder}")
-        say(f"{folder}/checkpoint.pt")
-        return exit_code
+        return training.train(settings, overrides, draw_media).exit_code
 
     sys.argv = ["vusfa train", *context.args]
     launch(job)

@@ -162,6 +162,12 @@ def _check_ranges(settings: Mapping[str, Any]) -> None:
         raise ConfigError(
             f"early_stopping.success is {share}; it is a share of episodes, at most 1: give 0.9"
         )
+    interval = settings["evaluation"]["interval"]
+    if interval not in ("auto", None) and (type(interval) is not int or interval < 1):
+        raise ConfigError(
+            f"evaluation.interval is {_shown(interval)}; it must be auto, a number of frames such as 100000,"
+            " or null"
+        )
     if not 0 <= settings["seed"] < 2**32:
         raise ConfigError(f"seed is {brief(settings['seed'])}; it must be 0 to {2**32 - 1}")
 

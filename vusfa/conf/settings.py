@@ -155,15 +155,20 @@ class LoggerSettings:
     project: str
     mode: str | None
     name: str | None
+    entity: str | None = None
+    group: str | None = None
+    tags: list[str] = field(default_factory=list)
 
 
 @dataclass
 class EvaluationSettings:
-    """Of the evaluation at the end; goals may be a word, a list of ids, or null."""
+    """Of the evaluation at the end, whose goals may be a word, a list of ids, or null; and of those during
+    the training, whose interval is ``"auto"``, a number of frames, or null."""
 
     goals: Any
     episodes_per_goal: int
     max_steps: int = MAX_STEPS
+    interval: Any = "auto"
 
 
 @dataclass

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import torch
@@ -13,7 +15,7 @@ from vusfa.errors import ConfigError
 from vusfa.scenes import Scene, SceneSet
 from vusfa.scenes.poses import dart, places, step_length
 
-__all__ = ["draw_map", "draw_panels"]
+__all__ = ["draw_map", "draw_panels", "draw_values"]
 
 _PANELS = ("view", "goal", "map")
 _HEIGHT = 150  # of a map that stands alone, in pixels
@@ -21,6 +23,7 @@ _GAP = 8  # between panels
 _SMOOTH = 4  # drawn this many times larger, then shrunk
 _PAPER, _FLOOR, _EDGE = (250, 250, 247), (221, 224, 230), (188, 193, 203)
 _AGENT, _TRAIL, _GOAL = (31, 97, 182), (142, 178, 224), (214, 69, 44)
+_LOW, _HIGH = (232, 240, 250), (9, 48, 107)  # of values from 0 to 1
 
 _Point = tuple[float, float]
 
@@ -74,30 +77,73 @@ def draw_map(scene: Scene, trail: Sequence[int], goal: int, size: int = _HEIGHT)
     >>> draw_map(Scene.bundled("bathroom"), [0], goal=73, size=64).shape
     (64, 64, 3)
     """
-    cells = places(scene.location)
-    cell = step_length(cells)
-    low, high = cells.amin(0) - cell, cells.amax(0) + cell
-    side = size * _SMOOTH
-    scale = side / max(float((high - low).max()), 1e-6)
-    left, bottom = ((side - scale * float(length)) / 2 for length in (high - low))
+    floor = _Floor(scene, size)
+    path = [floor.pixel(scene.location[state]) for state in trail]
+    floor.draw.line(path, fill=_TRAIL, width=max(_SMOOTH, int(floor.half / 3)), joint="curve")
+    floor.dart(goal, _GOAL)
+    floor.dart(trail[-1], _AGENT, 0.9)
+    return floor.shrunk()
 
-    def pixel(place: Tensor) -> _Point:
-        x, z = ((place - low) * scale).tolist()
-        return left + x, side - bottom - z
 
-    image = Image.new("RGB", (side, side), _PAPER)
-    draw = ImageDraw.Draw(image)
-    half = cell * scale / 2
-    for place in cells:
-        x, y = pixel(place)
-        draw.rectangle(
-            [x - half, y - half, x + half, y + half], fill=_FLOOR, outline=_EDGE, width=_SMOOTH // 2
-        )
-    path = [pixel(scene.location[state]) for state in trail]
-    draw.line(path, fill=_TRAIL, width=max(_SMOOTH, int(half / 3)), joint="curve")
-    longest = max(half * 0.9, side * 0.04)  # to be seen in large rooms, too
-    for state, color, length in ((goal, _GOAL, longest), (trail[-1], _AGENT, longest * 0.9)):
-        x, y = pixel(scene.location[state])
-        corners = dart(float(scene.rotation[state]))
-        draw.polygon([(x + length * right, y + length * down) for right, down in corners], fill=color)
-    return np.asarray(image.resize((size, size), Image.Resampling.LANCZOS))
+def draw_values(scene: Scene, values: Tensor, goals: Sequence[int] = (), size: int = 300) -> np.ndarray:
+    """Map of a scene whose places have the color of the mean of their states' values; (size, size, 3) uint8.
+
+    Args:
+        scene: the scene.
+        values: (N,) of its states, 0 to 1: from light to dark; NaN: grey.
+        goals: state ids within the scene, drawn as arrows.
+        size: pixels per side.
+
+    >>> bathroom = Scene.bundled("bathroom")
+    >>> draw_values(bathroom, torch.rand(bathroom.num_states), goals=[73], size=64).shape
+    (64, 64, 3)
+    """
+    cells, place = torch.unique(scene.location, dim=0, return_inverse=True)
+    known = ~values.isnan()
+    sums = torch.zeros(2, len(cells), dtype=torch.float64)
+    sums.index_add_(1, place[known], torch.stack([values[known].double(), known[known].double()]))
+    floor = _Floor(scene, size)
+    low, high = (torch.tensor(color, dtype=torch.float64) for color in (_LOW, _HIGH))
+    for cell, value in zip(cells, (sums[0] / sums[1]).tolist(), strict=True):
+        if not math.isnan(value):
+            floor.square(cell, tuple(torch.lerp(low, high, value).round().int().tolist()))
+    for goal in goals:
+        floor.dart(goal, _GOAL)
+    return floor.shrunk()
+
+
+class _Floor:
+    """The places of a scene, drawn several times larger than they will be."""
+
+    def __init__(self, scene: Scene, size: int) -> None:
+        self.scene, self.size = scene, size
+        cells = places(scene.location)
+        cell = step_length(cells)
+        self._low, high = cells.amin(0) - cell, cells.amax(0) + cell
+        self._side = size * _SMOOTH
+        self._scale = self._side / max(float((high - self._low).max()), 1e-6)
+        margins = ((self._side - self._scale * float(length)) / 2 for length in (high - self._low))
+        self._left, self._bottom = margins
+        self.half = cell * self._scale / 2
+        self._image = Image.new("RGB", (self._side, self._side), _PAPER)
+        self.draw = ImageDraw.Draw(self._image)
+        for place in cells:
+            self.square(place, _FLOOR)
+
+    def pixel(self, place: Tensor) -> _Point:
+        x, z = ((place - self._low) * self._scale).tolist()
+        return self._left + x, self._side - self._bottom - z
+
+    def square(self, place: Tensor, color: Any) -> None:
+        (x, y), half = self.pixel(place), self.half
+        corners = [x - half, y - half, x + half, y + half]
+        self.draw.rectangle(corners, fill=color, outline=_EDGE, width=_SMOOTH // 2)
+
+    def dart(self, state: int, color: Any, size: float = 1.0) -> None:
+        x, y = self.pixel(self.scene.location[state])
+        length = size * max(self.half * 0.9, self._side * 0.04)  # to be seen in large rooms, too
+        corners = dart(float(self.scene.rotation[state]))
+        self.draw.polygon([(x + length * right, y + length * down) for right, down in corners], fill=color)
+
+    def shrunk(self) -> np.ndarray:
+        return np.asarray(self._image.resize((self.size, self.size), Image.Resampling.LANCZOS))

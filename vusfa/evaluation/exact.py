@@ -20,11 +20,18 @@ from torch import Tensor
 
 from vusfa.envs.dynamics import MAX_STEPS
 from vusfa.evaluation.episodes import Episodes
-from vusfa.evaluation.metrics import metrics_within
+from vusfa.evaluation.metrics import METRICS, metrics_within
 from vusfa.scenes import SceneSet
 from vusfa.scenes.markov import arrival_by_step, goals_at_once
 
-__all__ = ["ExactGoals", "ExpectedWalks", "exact_goals", "expected_walks", "uniform_probabilities"]
+__all__ = [
+    "ExactGoals",
+    "ExpectedWalks",
+    "exact_goals",
+    "expected_walks",
+    "sampled_walks",
+    "uniform_probabilities",
+]
 
 #: From ids of states, goals and scenes, (R,) each, to the probabilities (R, A) of the actions.
 Probabilities = Callable[[Tensor, Tensor, Tensor], Tensor]
@@ -59,7 +66,7 @@ def uniform_probabilities(num_actions: int) -> Probabilities:
 class ExpectedWalks(NamedTuple):
     """Expectations over episodes of at most K actions, per goal, over all starts that can reach it.
 
-    Each is (G,) float64.
+    Each is (G,) float64 but for the last; NaN for a goal without a start.
 
     Attributes:
         length: actions; a failure counts as K.
@@ -67,6 +74,9 @@ class ExpectedWalks(NamedTuple):
         arrived_length: actions of successful episodes, 0 for a failure.
         arrived_shortest: shortest paths of successful episodes, 0 for a failure.
         shortest: shortest paths.
+        spl: success weighted by path length.
+        from_start: (S,) float64, success from each state of all scenes, mean over the goals that it can
+            reach; NaN where there is none.
     """
 
     length: Tensor
@@ -74,18 +84,29 @@ class ExpectedWalks(NamedTuple):
     arrived_length: Tensor
     arrived_shortest: Tensor
     shortest: Tensor
+    spl: Tensor
+    from_start: Tensor
+
+    def length_ratio_of(self, goals: Tensor) -> float:
+        """Length of successful episodes over their shortest paths: a ratio of means over some of the goals.
+
+        Args:
+            goals: (G,) bool.
+        """
+        arrived = (column[goals].nansum() for column in (self.arrived_length, self.arrived_shortest))
+        return torch.div(*arrived).item()
 
     @property
     def length_ratio(self) -> float:
-        """Length of successful episodes over their shortest paths: a ratio of means over goals."""
-        return (self.arrived_length.sum() / self.arrived_shortest.sum()).item()
+        """The same over all goals."""
+        return self.length_ratio_of(torch.ones_like(self.success, dtype=torch.bool))
 
 
 @torch.no_grad()
 def expected_walks(
     probabilities: Probabilities | None, scenes: SceneSet, goals: Tensor, max_steps: int = MAX_STEPS
 ) -> ExpectedWalks:
-    r"""Expected length and success of episodes, with T the actions until the goal and K ``max_steps``:
+    r"""Expected length, success and SPL of episodes, with T the actions until the goal and K ``max_steps``:
     E[min(T, K)], P(T <= K), E[T; T <= K].
 
     Args:
@@ -97,19 +118,64 @@ def expected_walks(
     >>> walks = expected_walks(None, SceneSet.bundled(["bathroom"]), torch.tensor([3, 90]))
     >>> 500 > walks.length.mean().item() > 10 * walks.shortest.mean().item() > 10
     True
+    >>> walks.spl.mean().item() < walks.success.mean().item() < walks.from_start.max().item() < 1
+    True
     """
     probabilities = probabilities or uniform_probabilities(scenes.num_actions)
-    parts = []
-    for index in range(scenes.num_scenes):
-        here = goals[scenes.scene_id[goals] == index] - int(scenes.offsets[index])
-        for _, chance, shortest in _distributions(probabilities, scenes, index, here, max_steps):
+    parts, summed = [], torch.zeros(2, scenes.num_states, dtype=torch.float64)
+    for index, scene in enumerate(scenes.scenes):
+        first = int(scenes.offsets[index])
+        here = goals[scenes.scene_id.to(goals.device)[goals] == index] - first
+        for block, chance, shortest, arrival in _distributions(probabilities, scenes, index, here, max_steps):
             steps = torch.arange(chance.shape[1], dtype=torch.float64)[:, None]
             ways = torch.arange(chance.shape[2], dtype=torch.float64)
             success = chance.sum((1, 2))
             arrived = (chance * steps).sum((1, 2))
             length = arrived + max_steps * (1 - success)
-            parts.append((length, success, arrived, (chance * ways).sum((1, 2)), shortest))
-    return ExpectedWalks(*(torch.cat(column) for column in zip(*parts, strict=True)))
+            spl = (chance * (ways / torch.maximum(steps, ways).clamp(min=1))).sum((1, 2))
+            parts.append((length, success, arrived, (chance * ways).sum((1, 2)), shortest, spl))
+            starts = scene.distances_to(block) > 0
+            summed[:, first : first + scene.num_states] += torch.stack(
+                [(arrival * starts).sum(0), starts.sum(0)]
+            )
+    columns = [torch.cat(column) for column in zip(*parts, strict=True)]
+    return ExpectedWalks._make([*columns, summed[0] / summed[1]])
+
+
+def sampled_walks(episodes: Episodes, scenes: SceneSet, goals: Tensor) -> ExpectedWalks:
+    """Means over episodes in place of the expectations of :func:`expected_walks`, for agents of several
+    frames.
+
+    Args:
+        episodes: of :func:`~vusfa.evaluation.evaluate`.
+        scenes: the world.
+        goals: (G,) global ids.
+
+    >>> from vusfa.evaluation import evaluate
+    >>> from vusfa.modules import make_agent
+    >>> rooms, goals = SceneSet.bundled(["bathroom"]), torch.tensor([3, 90])
+    >>> actor = make_agent("gvf", scenes=rooms, hidden_size=8).get_policy_operator()
+    >>> walks = sampled_walks(evaluate(actor, rooms, goals, max_steps=9), rooms, goals)
+    >>> bool((walks.spl <= walks.success).all()), walks.from_start.shape
+    (True, torch.Size([176]))
+    """
+    offsets = scenes.offsets.cpu()[episodes.scene]
+    number = torch.full((scenes.num_states,), -1)
+    number[goals.cpu()] = torch.arange(len(goals))
+
+    def mean(values: Tensor, rows: Tensor, size: int) -> Tensor:
+        sums = torch.zeros(2, size, dtype=torch.float64)
+        sums.index_add_(1, rows, torch.stack([values.double(), torch.ones_like(values).double()]))
+        return sums[0] / sums[1]
+
+    success, length, shortest = episodes.success, episodes.length, episodes.shortest
+    parts = METRICS["spl"].parts(episodes)
+    assert parts is not None, "SPL is defined for all episodes"
+    columns = (length, success, success * length, success * shortest, shortest, parts[0])
+    goal = number[episodes.goal + offsets]
+    means = [mean(column, goal, len(goals)) for column in columns]
+    from_start = mean(success, episodes.start + offsets, scenes.num_states)
+    return ExpectedWalks._make([*means, from_start])
 
 
 @torch.no_grad()
@@ -143,7 +209,7 @@ def exact_goals(
         scores = torch.stack([_score(metric.parts(weights)) for metric in metrics])
         scores = scores.view(len(metrics), max_steps + 1, longest + 1)
         every = torch.arange(scene.num_states)
-        for goals, chance, shortest in _distributions(
+        for goals, chance, shortest, _ in _distributions(
             probabilities, scenes, index, every, max_steps, at_once
         ):
             values = torch.einsum("gkd,mkd->mg", chance, scores)
@@ -173,10 +239,10 @@ def _distributions(
     goals: Tensor,
     max_steps: int,
     at_once: int | None = None,
-) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
+) -> Iterator[tuple[Tensor, Tensor, Tensor, Tensor]]:
     """Of a scene's goals, in blocks: ids (g,); the probability (g, K + 1, D) that an episode arrives with its
     k-th action and its shortest path has d; the mean shortest path (g,), NaN for a goal that no start
-    reaches."""
+    reaches; the probability (g, N) of arriving within K actions from each state."""
     scene, first = scenes.scenes[index], int(scenes.offsets[index])
     size, longest = scene.num_states, scene.longest_path
     for block in goals.split(at_once or goals_at_once(size)) if len(goals) else ():
@@ -196,4 +262,5 @@ def _distributions(
         for k, (before, now) in enumerate(pairwise(walks), 1):
             chance[:, k] = torch.from_numpy(binned @ (now - before).flatten().numpy()).view(count, -1)
         number = starts.sum(1)
-        yield block, chance / number[:, None, None], (shortest * starts).sum(1) / number.double()
+        mean = (shortest * starts).sum(1) / number.double()
+        yield block, chance / number[:, None, None], mean, now

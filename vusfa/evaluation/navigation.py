@@ -25,7 +25,7 @@ from vusfa.evaluation.starts import Unreachable, episode_starts
 from vusfa.modules import InferencePolicy
 from vusfa.scenes import SceneSet
 
-__all__ = ["evaluate", "trails", "walk"]
+__all__ = ["acting", "evaluate", "trails", "walk"]
 
 Observe = Callable[[TensorDictBase], TensorDictBase]
 Progress = Callable[[int, int], None]
@@ -84,7 +84,7 @@ def evaluate(
             unreachable=unreachable,
             generator=generator,
         )
-    with _acting(policy, scenes, sample, seed):
+    with acting(policy, scenes, sample, seed):
         success, length, collisions, end = walk(
             policy,
             scenes,
@@ -226,7 +226,7 @@ def trails(
     (5, True)
     """
     visited: list[tuple[Tensor, Tensor]] = []
-    with _acting(policy, scenes, True, seed):
+    with acting(policy, scenes, True, seed):
         limits: dict[str, Any] = {"max_steps": max_steps, "history": history}
         walk(policy, scenes, start, goal, **limits, observe=observe, visited=visited)
     ways = [[state] for state in start.tolist()]
@@ -237,8 +237,14 @@ def trails(
 
 
 @contextmanager
-def _acting(policy: nn.Module, scenes: SceneSet, sample: bool, seed: int) -> Iterator[None]:
-    """Evaluation mode, cached inference policies and an own random state; all restored afterwards."""
+def acting(policy: nn.Module, scenes: SceneSet, sample: bool = True, seed: int = 0) -> Iterator[None]:
+    """Evaluation mode, cached inference policies and an own random state; all restored afterwards.
+
+    Args:
+        policy: a policy, or an agent.
+        scenes: on its device.
+        sample, seed: see :func:`evaluate`.
+    """
     modes = [(module, module.training) for module in policy.modules()]
     policy.eval()
     devices = [scenes.device] if scenes.device.type == "cuda" else []

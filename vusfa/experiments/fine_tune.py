@@ -8,12 +8,9 @@ from typing import Any
 
 from torch import Tensor
 
-from vusfa.evaluation import evaluate
-from vusfa.evaluation.exact import expected_walks
-from vusfa.evaluation.metrics import get_metric
-from vusfa.modules import InferencePolicy, TabularPolicy
+from vusfa.experiments.measure import measure_goals
 from vusfa.scenes import SceneSet
-from vusfa.training import Trainer, make_trainer
+from vusfa.training import make_trainer
 
 __all__ = ["fine_tune", "fine_tuning_settings"]
 
@@ -67,7 +64,9 @@ def fine_tune(
     curve: dict[str, list[float]] = {key: [] for key in ("frames", "length", "success", "length_ratio")}
 
     def look() -> None:
-        seen = _expected(trainer) if trainer.agent.is_tabular else _walked(trainer, episodes_per_goal)
+        steps = settings["env"]["max_steps"]
+        walks = measure_goals(trainer, trainer.goals, episodes_per_goal=episodes_per_goal, max_steps=steps)
+        seen = walks.length.mean().item(), walks.success.mean().item(), walks.length_ratio
         for key, value in zip(curve, (float(trainer.frames), *seen), strict=True):
             curve[key].append(value)
 
@@ -80,27 +79,3 @@ def fine_tune(
             if ended or before // every < trainer.frames // every:
                 look()
     return curve
-
-
-def _expected(trainer: Trainer) -> tuple[float, float, float]:
-    """Length, success and length over shortest path of a one-frame agent, exact."""
-    steps = trainer.settings["env"]["max_steps"]
-    policy = TabularPolicy(trainer.agent, trainer.scenes, trainer.goals)
-    walks = expected_walks(policy.probabilities, trainer.scenes, trainer.goals, steps)
-    return walks.length.mean().item(), walks.success.mean().item(), walks.length_ratio
-
-
-def _walked(trainer: Trainer, episodes_per_goal: int) -> tuple[float, float, float]:
-    """The same of any other agent, sampled."""
-    table = evaluate(
-        InferencePolicy(trainer.agent),
-        trainer.scenes,
-        trainer.goals,
-        episodes_per_goal=episodes_per_goal,
-        max_steps=trainer.settings["env"]["max_steps"],
-        history=trainer.agent.config["history"],
-        seed=0,
-        observe=trainer.observation,
-    )
-    mean_length, success = table.length.double().mean().item(), table.success.double().mean().item()
-    return mean_length, success, get_metric("length_ratio").value(table)

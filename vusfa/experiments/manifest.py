@@ -21,7 +21,14 @@ from vusfa.files import replacing
 from vusfa.reading import read_npz
 from vusfa.scenes import SceneSet
 
-__all__ = ["BUNDLED_MANIFEST", "Manifest", "make_manifest", "read_manifest", "write_manifest"]
+__all__ = [
+    "BUNDLED_MANIFEST",
+    "Manifest",
+    "draw_goals",
+    "make_manifest",
+    "read_manifest",
+    "write_manifest",
+]
 
 BUNDLED_MANIFEST = Path(__file__).parent / "manifests" / "bundled.npz"
 
@@ -91,12 +98,23 @@ def make_manifest(
     """
     generator = torch.Generator().manual_seed(seed)
     every = resolve_goals(scenes, "all")
+    held_out = draw_goals(scenes, every[~torch.isin(every, trained.cpu())], validation_goals, generator)
+    start, goal = episode_starts(scenes, every, episodes_per_goal, generator=generator)
+    return Manifest(start, goal, torch.isin(goal, held_out), seed, scenes.fingerprint)
+
+
+def draw_goals(scenes: SceneSet, goals: Tensor, per_scene: int, generator: torch.Generator) -> Tensor:
+    """At most so many of the goals (G,), global ids, per scene; scene by scene.
+
+    >>> rooms, generator = SceneSet.bundled(["bathroom", "kitchen"]), torch.Generator().manual_seed(0)
+    >>> draw_goals(rooms, torch.tensor([3, 5, 7, 300]), 2, generator).shape
+    torch.Size([3])
+    """
     chosen = []
     for index in range(scenes.num_scenes):
-        here = every[(scenes.scene_id.cpu()[every] == index) & ~torch.isin(every, trained.cpu())]
-        chosen.append(here[torch.randperm(len(here), generator=generator)[:validation_goals]])
-    start, goal = episode_starts(scenes, every, episodes_per_goal, generator=generator)
-    return Manifest(start, goal, torch.isin(goal, torch.cat(chosen)), seed, scenes.fingerprint)
+        here = goals[scenes.scene_id.cpu()[goals] == index]
+        chosen.append(here[torch.randperm(len(here), generator=generator)[:per_scene]])
+    return torch.cat(chosen)
 
 
 def write_manifest(path: str | Path, manifest: Manifest) -> Path:

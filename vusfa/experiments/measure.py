@@ -11,13 +11,14 @@ import torch
 from tensordict.nn import TensorDictModuleBase
 
 from vusfa.evaluation import Episodes, evaluate
-from vusfa.evaluation.exact import exact_goals
+from vusfa.evaluation.exact import ExpectedWalks, exact_goals, expected_walks, sampled_walks
 from vusfa.evaluation.metrics import get_metric
+from vusfa.evaluation.navigation import acting
 from vusfa.experiments.manifest import BUNDLED_MANIFEST, Manifest, make_manifest, read_manifest
 from vusfa.experiments.runs import Run
 from vusfa.modules import Agent, InferencePolicy, TabularPolicy
 from vusfa.scenes import SceneSet
-from vusfa.training import load_agent, make_observation
+from vusfa.training import Trainer, load_agent, make_observation
 from vusfa.training.facts import run_facts
 from vusfa.training.precision import resolve_autocast
 from vusfa.training.progress import EvaluationProgress
@@ -28,6 +29,7 @@ __all__ = [
     "evaluation_precision",
     "manifest_for",
     "measure_checkpoint",
+    "measure_goals",
     "walk_manifest",
 ]
 
@@ -120,6 +122,42 @@ def measure_checkpoint(
     exact = exact_goals(policy.probabilities, scenes) if isinstance(policy, TabularPolicy) else None
     info = {**run_facts(state, overrides), "checkpoint": checkpoint.name}
     return Run(experiment, name, info, tables, exact)
+
+
+def measure_goals(
+    trainer: Trainer, goals: torch.Tensor, *, episodes_per_goal: int, max_steps: int
+) -> ExpectedWalks:
+    """How an agent in training reaches goals, actions sampled; weights and random states stay as they are.
+
+    Args:
+        trainer: of the agent.
+        goals: (G,) global ids, scene by scene.
+        episodes_per_goal: for an agent of several frames, from the same starts each time; one-frame agents
+            that read ids are measured exactly.
+        max_steps: limit of actions per episode.
+    """
+    agent, device = trainer.agent, next(trainer.agent.parameters()).device
+    scenes = trainer.scenes.to(device)
+    if agent.is_tabular:
+        with acting(agent, scenes):
+            table = TabularPolicy(agent, scenes, goals)
+        return expected_walks(
+            lambda *ids: table.probabilities(*(each.to(device) for each in ids)).cpu(),
+            scenes,
+            goals,
+            max_steps,
+        )
+    with evaluation_precision(agent, trainer.settings):
+        episodes = evaluate(
+            InferencePolicy(agent),
+            scenes,
+            goals,
+            episodes_per_goal=episodes_per_goal,
+            max_steps=max_steps,
+            history=agent.config["history"],
+            observe=trainer.observation,
+        )
+    return sampled_walks(episodes, scenes, goals)
 
 
 def walk_manifest(

@@ -13,6 +13,7 @@ from vusfa.conf.compose import compose
 from vusfa.conf.schema import register_schema
 from vusfa.evaluation import Comparison, check_comparison, compare, evaluate, print_summary
 from vusfa.experiments.measure import evaluation_policy, evaluation_precision
+from vusfa.experiments.validation import Draw, Validation
 from vusfa.files import say
 from vusfa.training import (
     EvaluationProgress,
@@ -30,12 +31,13 @@ from vusfa.training.folder import AUTO, CHECKPOINT, found_checkpoint
 from vusfa.training.precision import describe_autocast
 from vusfa.training.scene_files import settings_seen_from
 from vusfa.training.setup import decide_autocast
+from vusfa.training.trackers import sweep_run_id
 
 __all__ = ["Trained", "compose_settings", "train"]
 
 
 class Trained(NamedTuple):
-    """Result of :func:`train`.
+    """The result of :func:`train`.
 
     Attributes:
         trainer: with the trained agent.
@@ -56,13 +58,16 @@ def compose_settings(overrides: Sequence[str]) -> DictConfig:
     return settings
 
 
-def train(settings: Mapping[str, Any], overrides: Sequence[str] = ()) -> Trained:
-    """Trains, and leaves metrics, a checkpoint and an evaluation in ``settings["folder"]`` (that of the
-    trainer's settings where the caller's are null).
+def train(settings: Mapping[str, Any], overrides: Sequence[str] = (), draw: Draw | None = None) -> Trained:
+    """Train, and leave metrics, checkpoints and an evaluation in ``settings["folder"]`` (that of the
+    trainer's settings where the caller's are null). The last lines say where, and whether a random walk does
+    better.
 
     Args:
         settings: as in vusfa/conf/train.yaml, resolved.
         overrides: their command line, recorded in checkpoints.
+        draw: makes media for trackers at every evaluation during the training, such as
+            :func:`vusfa.report.media.draw_media`.
 
     Raises:
         VusfaError: settings that make no sense, or a checkpoint that does not fit them.
@@ -80,6 +85,8 @@ def train(settings: Mapping[str, Any], overrides: Sequence[str] = ()) -> Trained
     if evaluated:
         check_comparison(trainer.scenes, **_evaluation(trainer))
     changes = trainer.resume(plain["resume"]) if plain["resume"] else []
+    if not plain["resume"] and "wandb" in plain["logger"]["kinds"]:
+        trainer.run_id = sweep_run_id() or trainer.run_id
     with ExitStack() as stack:
         stack.enter_context(folder)
         plain["folder"] = str(folder.path)
@@ -92,6 +99,7 @@ def train(settings: Mapping[str, Any], overrides: Sequence[str] = ()) -> Trained
                 **plain["logger"],
             )
         )
+        path, validation = folder.path / CHECKPOINT, None
         notes = [] if trainer.note is None else [trainer.note]
         precision = describe_autocast(plain["autocast"], decided=decided)
         for line in (precision, *notes, *(f"resumed with {change}" for change in changes)):
@@ -99,7 +107,9 @@ def train(settings: Mapping[str, Any], overrides: Sequence[str] = ()) -> Trained
         with StopOnSignal() as stop, ProgressLine(plain["total_frames"]) as progress:
             stops_early = plain["early_stopping"]["success"] is not None
             converged = partial(_converged, trainer) if stops_early else None
-            run_training(trainer, folder.path / CHECKPOINT, loggers, stop, progress, converged)
+            if plain["evaluation"].get("interval", "auto") is not None:
+                validation = Validation(trainer, loggers, draw)
+            run_training(trainer, path, loggers, stop, progress, converged, validation)
         loggers.exit_code = stop.exit_code
         comparison = None
         if evaluated and not stop.received:
@@ -108,6 +118,10 @@ def train(settings: Mapping[str, Any], overrides: Sequence[str] = ()) -> Trained
             loggers.log_table("evaluation", comparison.rows, trainer.frames)
             with suppress(BrokenPipeError):
                 print_summary(comparison.rows, note=comparison.note)
+    say(f"next: vusfa report {folder.path}, vusfa film {folder.path}, vusfa evaluate {folder.path}")
+    say(str(path))
+    if validation is not None and not stop.received and (advice := validation.advice()):
+        say(advice)
     return Trained(trainer, comparison, stop.exit_code)
 
 
@@ -134,8 +148,8 @@ def _converged(trainer: Trainer) -> bool:
 
 
 def _evaluation(trainer: Trainer) -> dict[str, Any]:
-    """Goals and numbers of the evaluation."""
-    chosen = dict(trainer.settings["evaluation"])
+    """Goals and numbers of the evaluation at the end."""
+    chosen = {key: value for key, value in trainer.settings["evaluation"].items() if key != "interval"}
     return {**chosen, "goals": trainer.goals if chosen["goals"] == "trained" else chosen["goals"]}
 
 

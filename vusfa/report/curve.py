@@ -26,7 +26,8 @@ def read_metrics(path: str | Path) -> dict[str, np.ndarray]:
 def plot_curve(
     metrics: str | Path, path: str | Path, random_walk: float | None = None, title: str = ""
 ) -> Path:
-    """Success and length over shortest path against frames, as PNG, atomically.
+    """Success and length over shortest path against frames, as PNG, atomically: of the evaluations during
+    the training, or, where there were none, of the episodes that ended.
 
     Args:
         metrics: the run's ``metrics.csv``.
@@ -45,13 +46,22 @@ def plot_curve(
     frames = columns["frames"] / 1000
     figure = Figure(figsize=(7, 4.5), layout="constrained")
     upper, lower = figure.subplots(2, 1, sharex=True)
-    upper.plot(frames, 100 * columns["success"], color="#1f61b6")
-    upper.set_ylabel("success in training (%)")
+    evaluated = "eval/trained/success" in columns
+    for goals, color in (("trained", "#1f61b6"), ("validation", "#d6452c")) if evaluated else ():
+        success = columns[f"eval/{goals}/success"]
+        known = np.isfinite(success)
+        upper.plot(frames[known], 100 * success[known], color=color, label=f"{goals} goals")
+        ratio = columns[f"eval/{goals}/length_ratio"]
+        lower.plot(frames[known], ratio[known], color=color)
+    if not evaluated:
+        upper.plot(frames, 100 * columns["success"], color="#1f61b6")
+        lower.plot(frames, columns["length_ratio"], color="#d6452c")
+    upper.set_ylabel("success (%)" if evaluated else "success in training (%)")
     upper.set_ylim(0, 102)
     if random_walk is not None:
         upper.axhline(100 * random_walk, color="#888888", linestyle="--", label="random walk")
+    if evaluated or random_walk is not None:
         upper.legend(loc="lower right", frameon=False)
-    lower.plot(frames, columns["length_ratio"], color="#d6452c")
     lower.axhline(1.0, color="#888888", linestyle="--", label="shortest path")
     lower.set_yscale("log")
     lower.set_ylabel("length / shortest")

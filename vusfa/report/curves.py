@@ -12,7 +12,13 @@ from vusfa.report.runs import LoggedRun
 __all__ = ["band", "curve_names", "learning_curves"]
 
 _POINTS = 400  # of a curve on the page; longer logs are thinned
+_EVALUATED = tuple(
+    f"eval/{goals}/{name}"
+    for name in ("success", "spl", "length_ratio")
+    for goals in ("trained", "validation")
+)
 _PLAIN = (
+    *_EVALUATED,
     "success",
     "length",
     "length_ratio",
@@ -25,11 +31,16 @@ _PLAIN = (
     "hindsight_value",
     "grad_norm",
 )
-_PER_SCENE = ("success", "length", "length_ratio")
+_PER_SCENE = ("success", "length", "length_ratio", *_EVALUATED[:4])
+#: Rates of the episodes that ended, which flatter a training's beginning: shown where runs lack evaluations.
+_ENDED = ("success", "length_ratio")
 
 
 def curve_names(runs: Sequence[LoggedRun]) -> list[str]:
     """Columns of metrics.csv on the page: the general ones that any run logged, and those per scene.
+
+    Where every run was evaluated during its training, these evaluations stand in place of the rates of the
+    episodes that ended.
 
     >>> from pathlib import Path
     >>> log = dict.fromkeys(["frames", "success", "scene/hall/success", "lr"], np.ones(1))
@@ -37,10 +48,14 @@ def curve_names(runs: Sequence[LoggedRun]) -> list[str]:
     ['success', 'scene/hall/success']
     """
     logged = dict.fromkeys(name for run in runs for name in run.curves)
+    evaluated = all(_EVALUATED[0] in run.curves for run in runs)
+    measures = [name for name in _PLAIN if not (evaluated and name in _ENDED)]
     per_scene = [
-        name for name in logged if name.startswith("scene/") and name.rpartition("/")[2] in _PER_SCENE
+        name
+        for name in logged
+        if name.startswith("scene/") and name.split("/", 2)[-1] in {*_PER_SCENE} & {*measures}
     ]
-    return [name for name in _PLAIN if name in logged] + per_scene
+    return [name for name in measures if name in logged] + per_scene
 
 
 def band(

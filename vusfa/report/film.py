@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -17,7 +18,7 @@ from vusfa.evaluation.navigation import Observe
 from vusfa.files import replacing
 from vusfa.scenes import SceneSet
 
-__all__ = ["draw_film", "farthest_pair", "longest_success", "record_walk", "write_gif"]
+__all__ = ["draw_film", "encode_gif", "farthest_pair", "longest_success", "record_walk", "write_gif"]
 
 _TITLE_HEIGHT = 22
 _INK, _PAPER = (60, 64, 72), (255, 255, 255)
@@ -153,6 +154,18 @@ def write_gif(path: str | Path, film: Sequence[Image.Image], frames_per_second: 
     Raises:
         ValueError: no pictures.
     """
+    data = encode_gif(film, frames_per_second)
+    with replacing(path) as unfinished:
+        unfinished.write_bytes(data)
+    return Path(path)
+
+
+def encode_gif(film: Sequence[Image.Image], frames_per_second: float = 4.0) -> bytes:
+    """A GIF as :func:`write_gif` writes it.
+
+    >>> encode_gif([Image.new("RGB", (4, 4))])[:6]
+    b'GIF89a'
+    """
     if not film:
         raise ValueError("a film needs at least one picture")
     pause = round(1000 / frames_per_second)
@@ -163,13 +176,8 @@ def write_gif(path: str | Path, film: Sequence[Image.Image], frames_per_second: 
         strip.paste(picture, (0, place * picture.height))
     palette = strip.quantize(256, method=Image.Quantize.MEDIANCUT)
     pictures = [picture.quantize(palette=palette, dither=Image.Dither.FLOYDSTEINBERG) for picture in film]
-    with replacing(path) as unfinished:
-        pictures[0].save(
-            unfinished,
-            format="GIF",
-            save_all=True,
-            append_images=pictures[1:],
-            duration=durations,
-            loop=0,
-        )
-    return Path(path)
+    encoded = io.BytesIO()
+    pictures[0].save(
+        encoded, format="GIF", save_all=True, append_images=pictures[1:], duration=durations, loop=0
+    )
+    return encoded.getvalue()

@@ -22,6 +22,7 @@ says what differs before anything is restored. Files of version 0.1 are converte
 ``meter``                  sums of the episodes since the last line of the log
 ``rng``                    random states: torch, CUDA, numpy, Python
 ``run_id``                 what the loggers call the run
+``validation``             best score, frames and seconds of the evaluations during the training (optional)
 =========================  ==================================================================================
 """
 
@@ -42,7 +43,7 @@ from vusfa.files import replacing
 from vusfa.limits import brief
 from vusfa.modules import Agent, make_agent
 from vusfa.scenes import SceneSet
-from vusfa.training.content import check_entries, check_like, mended, read_content
+from vusfa.training.content import NO_VALIDATION, check_entries, check_like, mended, read_content
 from vusfa.training.scene_files import find_given, find_source, with_goals
 from vusfa.training.upgrade import upgrade
 
@@ -127,6 +128,7 @@ def load_checkpoint(path: str | Path, device: torch.device | str = "cpu") -> dic
             f"{path}: checkpoint of format {brief(state.get('format'))}, this version reads 1 and"
             f" {FORMAT}; use the version that wrote it"
         )
+    state.setdefault("validation", dict(NO_VALIDATION))
     check_entries(path, state)
     state["scenes"]["sources"] = [find_source(source, path) for source in state["scenes"]["sources"]]
     state["config"] = with_goals(state["config"], lambda source: find_given(source, path))

@@ -24,7 +24,16 @@ from vusfa.errors import CheckpointError, VusfaError
 from vusfa.limits import brief
 from vusfa.reading import BoundedZip
 
-__all__ = ["ENTRIES", "check_entries", "check_like", "check_sizes", "mended", "read_content", "restore"]
+__all__ = [
+    "ENTRIES",
+    "NO_VALIDATION",
+    "check_entries",
+    "check_like",
+    "check_sizes",
+    "mended",
+    "read_content",
+    "restore",
+]
 
 #: Entries of a checkpoint and their types; :mod:`vusfa.training.checkpoint` says what they are.
 ENTRIES: dict[str, type | tuple[type, ...]] = {
@@ -44,6 +53,9 @@ ENTRIES: dict[str, type | tuple[type, ...]] = {
     "meter": dict,
     "rng": dict,
 }
+#: The entry ``validation`` before the first evaluation during a training, and in checkpoints without one.
+NO_VALIDATION: dict[str, float] = {"best": -1.0, "frames": 0, "seconds": 0.0, "last_seconds": 0.0}
+NO_VALIDATION |= {"media_seconds": 0.0, "last_media_seconds": 0.0}
 _SCENES: dict[str, type] = {"sources": list, "names": list, "fingerprint": str}
 #: Settings of a checkpoint that results name.
 _CONFIG: dict[str, type | tuple[type, ...]] = {
@@ -148,6 +160,8 @@ def check_entries(path: str | Path, state: Mapping[str, Any]) -> None:
     _check_types(path, "", state, ENTRIES)
     _check_types(path, "scenes.", state["scenes"], _SCENES)
     _check_types(path, "config.", state["config"], _CONFIG)
+    _check_types(path, "", state, {"validation": dict})
+    _check_types(path, "validation.", state["validation"], dict.fromkeys(NO_VALIDATION, (int, float)))
     _check_types(path, "config.agent.", state["config"]["agent"], {"model": str, "architecture": str})
     _check_types(path, "config.algorithm.", state["config"]["algorithm"], {"name": str})
     _check_types(path, "meter.", state["meter"], {"episodes": dict, "terms": dict})

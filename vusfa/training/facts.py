@@ -15,7 +15,7 @@ import torch
 from vusfa.training.precision import precision_name, resolve_autocast
 from vusfa.training.setup import row_name
 
-__all__ = ["machine_facts", "run_facts"]
+__all__ = ["machine_facts", "run_facts", "versions"]
 
 
 def machine_facts() -> dict[str, Any]:
@@ -30,8 +30,17 @@ def machine_facts() -> dict[str, Any]:
         "cores": os.cpu_count(),
         "gpu": torch.cuda.get_device_name() if torch.cuda.is_available() else None,
         "python": platform.python_version(),
-        "versions": {name: version(name) for name in ("vusfa", "torch", "torchrl", "tensordict")},
+        "versions": versions(),
     }
+
+
+def versions() -> dict[str, str]:
+    """Versions of this package and of the libraries that compute.
+
+    >>> list(versions())
+    ['vusfa', 'torch', 'torchrl', 'tensordict']
+    """
+    return {name: version(name) for name in ("vusfa", "torch", "torchrl", "tensordict")}
 
 
 def run_facts(state: Mapping[str, Any], overrides: Sequence[str] = ()) -> dict[str, Any]:

@@ -16,13 +16,15 @@ from typing import Any
 from vusfa.errors import ConfigError
 from vusfa.files import check_folder, remove_leftovers
 
-__all__ = ["AUTO", "CHECKPOINT", "RunFolder", "default_folder", "found_checkpoint"]
+__all__ = ["AUTO", "BEST", "CHECKPOINT", "RunFolder", "default_folder", "found_checkpoint"]
 
 #: ``resume`` of a run that goes on if there is something to go on with.
 AUTO = "auto"
 
-CHECKPOINT = "checkpoint.pt"
-_OF_A_RUN = (CHECKPOINT, "metrics.csv", "evaluation.csv", "evaluation.json", "evaluation_episodes.csv")
+#: The last checkpoint of a run, and the one with the best score of its evaluations during the training.
+CHECKPOINT, BEST = "checkpoint.pt", "best.pt"
+_OF_A_RUN = (CHECKPOINT, BEST, "metrics.csv", "validation.csv")
+_EVALUATION = ("evaluation.csv", "evaluation.json", "evaluation_episodes.csv")
 _LOCK = ".lock"
 
 
@@ -80,7 +82,7 @@ class RunFolder:
         self._refuse_other_run()
         remove_leftovers(self.path)
         if self._settings["overwrite"] and not self._resumes_here():
-            for name in _OF_A_RUN:
+            for name in (*_OF_A_RUN, *_EVALUATION):
                 with suppress(OSError):
                     (self.path / name).unlink()
         return self

@@ -2,8 +2,8 @@
 
 TorchRL's loggers (:mod:`torchrl.record.loggers`) were looked at and left: its CSVLogger writes one file per
 scalar and appends on resuming, where ours is one table whose later rows are taken out first, so that the
-file of a resumed run is that of an uninterrupted one; its TensorboardLogger and WandbLogger add to the
-libraries' own calls neither tables nor checkpoints as artifacts, which are what those here are for.
+file of a resumed run is that of an uninterrupted one; its TensorboardLogger and WandbLogger have neither
+tables nor checkpoints as artifacts, encode films with moviepy, and log a resumed run's rows twice.
 """
 
 from __future__ import annotations
@@ -23,16 +23,25 @@ __all__ = ["CSVLogger", "Logger", "Loggers", "make_loggers"]
 
 
 class Logger(Protocol):
-    """Receiver of metrics, checkpoints and tables."""
+    """Receiver of metrics, checkpoints, tables and media.
+
+    Attributes:
+        shows_media: whether :meth:`log_media` does anything.
+    """
+
+    shows_media: bool
 
     def log_metrics(self, metrics: Mapping[str, float], frames: int) -> None:
-        """Take a row of numbers after ``frames`` frames; NaN: a rate over no episode."""
+        """Log a row of numbers after ``frames`` frames; NaN: a rate over no episode."""
 
-    def log_checkpoint(self, path: Path, frames: int) -> None:
-        """Take note of a written checkpoint."""
+    def log_checkpoint(self, path: Path, frames: int, is_best: bool = False) -> None:
+        """Log a checkpoint, which is written; ``is_best``: it has the best score so far."""
 
     def log_table(self, name: str, rows: Sequence[Mapping[str, Any]], frames: int) -> None:
-        """Take a table of results, such as the summary of an evaluation."""
+        """Log a table of results, such as the summary of an evaluation."""
+
+    def log_media(self, media: Mapping[str, bytes], frames: int) -> None:
+        """Log pictures (PNG) and films (GIF) by name."""
 
     def close(self, exit_code: int = 0) -> None:
         """Finish: nothing follows."""
@@ -57,6 +66,8 @@ class CSVLogger:
     >>> (Path(folder) / "metrics.csv").read_text()
     'frames,loss,success\\n100,0.5,\\n'
     """
+
+    shows_media = False
 
     def __init__(
         self, folder: str | Path, config: Mapping[str, Any], resume_frames: int | None = None
@@ -110,9 +121,12 @@ class CSVLogger:
             raise cannot_write(self._file, error) from error
         self._columns = self._columns or list(row)
 
-    def log_checkpoint(self, path: Path, frames: int) -> None:
+    def log_checkpoint(self, path: Path, frames: int, is_best: bool = False) -> None:
         """Nothing to do: the file itself is the record."""
         self._begin()
+
+    def log_media(self, media: Mapping[str, bytes], frames: int) -> None:
+        """Nothing to do: a table has no pictures."""
 
     def log_table(self, name: str, rows: Sequence[Mapping[str, Any]], frames: int) -> None:
         """Write ``NAME.csv``."""
@@ -128,11 +142,13 @@ class Loggers:
 
     Attributes:
         exit_code: passed to ``close``; 1 after an exception.
+        shows_media: whether any of them does.
     """
 
     def __init__(self, loggers: Sequence[Logger]) -> None:
         self.loggers = tuple(loggers)
         self.exit_code = 0
+        self.shows_media = any(logger.shows_media for logger in loggers)
 
     def __enter__(self) -> Loggers:
         return self
@@ -146,13 +162,17 @@ class Loggers:
         """See :class:`Logger`."""
         self._tell("log_metrics", metrics, frames)
 
-    def log_checkpoint(self, path: Path, frames: int) -> None:
+    def log_checkpoint(self, path: Path, frames: int, is_best: bool = False) -> None:
         """See :class:`Logger`."""
-        self._tell("log_checkpoint", path, frames)
+        self._tell("log_checkpoint", path, frames, is_best)
 
     def log_table(self, name: str, rows: Sequence[Mapping[str, Any]], frames: int) -> None:
         """See :class:`Logger`."""
         self._tell("log_table", name, rows, frames)
+
+    def log_media(self, media: Mapping[str, bytes], frames: int) -> None:
+        """See :class:`Logger`."""
+        self._tell("log_media", media, frames)
 
     def close(self, exit_code: int = 0) -> None:
         """See :class:`Logger`."""
@@ -181,6 +201,9 @@ def make_loggers(
     project: str = "vusfa",
     mode: str | None = None,
     name: str | None = None,
+    entity: str | None = None,
+    group: str | None = None,
+    tags: Sequence[str] = (),
 ) -> Loggers:
     """Loggers by name: ``csv``, ``tensorboard``, ``wandb``.
 
@@ -190,7 +213,7 @@ def make_loggers(
         config: the run's configuration, plain data.
         run_id: the run's id, the same when it is resumed.
         resume_frames: frames of the checkpoint that the run continues from; None for a new run.
-        project, mode, name: of :class:`WandbLogger`.
+        project, mode, name, entity, group, tags: of :class:`WandbLogger`.
 
     Raises:
         ConfigError: unknown kind, its library is not installed, or wandb cannot begin.
@@ -198,7 +221,7 @@ def make_loggers(
     makers: dict[str, Callable[[], Logger]] = {
         "csv": lambda: CSVLogger(folder, config, resume_frames),
         "tensorboard": lambda: TensorBoardLogger(Path(folder) / "tensorboard", config),
-        "wandb": lambda: WandbLogger(folder, config, run_id, project, mode, name),
+        "wandb": lambda: WandbLogger(folder, config, run_id, project, mode, name, entity, group, tags),
     }
     for kind in kinds:
         if kind not in makers:

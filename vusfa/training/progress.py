@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from types import TracebackType
 from typing import TYPE_CHECKING
@@ -50,7 +50,7 @@ class ProgressLine:
         self._every = every
         self._clock = clock
         self._recent: deque[tuple[float, int]] = deque(maxlen=200)
-        self._success = self._ratio = math.nan
+        self._success = self._ratio = self._unseen = math.nan
         self._printed = -math.inf
         self._line = ""
         self._live: Live | None = None
@@ -60,10 +60,17 @@ class ProgressLine:
             )
             self._live.start()
 
-    def rates(self, success: float, length_ratio: float) -> None:
-        """Set success and length ratio; NaN keeps what is shown."""
-        self._success = self._success if math.isnan(success) else success
-        self._ratio = self._ratio if math.isnan(length_ratio) else length_ratio
+    def rates(self, metrics: Mapping[str, float], validated: bool = False) -> None:
+        """Set success and length ratio from a line of the log; NaN keeps what is shown.
+
+        Args:
+            metrics: of the log.
+            validated: show the evaluations during the training, not the episodes that ended.
+        """
+        trained, unseen = "eval/trained/" if validated else "", "eval/validation/success"
+        self._success = _or(metrics.get(f"{trained}success", math.nan), self._success)
+        self._ratio = _or(metrics.get(f"{trained}length_ratio", math.nan), self._ratio)
+        self._unseen = _or(metrics.get(unseen, math.nan), self._unseen)
 
     def update(self, frames: int) -> None:
         """Set how many are done."""
@@ -73,7 +80,8 @@ class ProgressLine:
         self._recent.append((now, frames))
         (then, before) = self._recent[0]
         speed = (frames - before) / (now - then) if now > then else math.nan
-        line = describe(frames, self._total, speed, self._success, self._ratio, self._unit)
+        rates = self._success, self._ratio, self._unseen
+        line = describe(frames, self._total, speed, *rates, unit=self._unit)
         self._line = printable(line)
         if self._live is None and now - self._printed >= self._every:
             self._print(now)
@@ -135,18 +143,28 @@ class EvaluationProgress:
 
 
 def describe(
-    frames: int, total: int, speed: float, success: float, length_ratio: float, unit: str = "frames"
+    frames: int,
+    total: int,
+    speed: float,
+    success: float,
+    length_ratio: float,
+    unseen: float = math.nan,
+    *,
+    unit: str = "frames",
 ) -> str:
     """Text of the line; NaN: not known yet.
 
     >>> describe(250_000, 1_000_000, 5000.0, 0.975, 1.127)
-    '250,000 of 1,000,000 frames | 5,000 a second | success 97.5 % | length / shortest 1.13 | 2:30 to go'
+    '250,000 of 1,000,000 frames | 5,000 per second | success 97.5 % | length / shortest 1.13 | 2:30 to go'
+    >>> describe(1000, 1000, math.nan, 0.975, math.nan, 0.42)
+    '1,000 of 1,000 frames | success 97.5 %, validation goals 42.0 %'
     """
     parts = [f"{frames:,} of {total:,} {unit}"]
     if not math.isnan(speed):
-        parts.append(f"{speed:,.0f} a second")
+        parts.append(f"{speed:,.0f} per second")
     if not math.isnan(success):
-        parts.append(f"success {100 * success:.1f} %")
+        validation = "" if math.isnan(unseen) else f", validation goals {100 * unseen:.1f} %"
+        parts.append(f"success {100 * success:.1f} %{validation}")
     if not math.isnan(length_ratio):
         parts.append(f"length / shortest {length_ratio:.2f}")
     if speed > 0:
@@ -154,3 +172,7 @@ def describe(
         hours, minutes = divmod(minutes, 60)
         parts.append((f"{hours}:{minutes:02}" if hours else f"{minutes}") + f":{seconds:02} to go")
     return " | ".join(parts)
+
+
+def _or(value: float, otherwise: float) -> float:
+    return otherwise if math.isnan(value) else value

@@ -2,18 +2,29 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+import math
+import shutil
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 
 from tensordict import TensorDictBase
 
 from vusfa.errors import ResultError, VusfaError, WorkerError
+from vusfa.files import replacing
+from vusfa.training.folder import BEST
 from vusfa.training.loggers import Logger
 from vusfa.training.progress import ProgressLine
 from vusfa.training.signals import StopOnSignal
 from vusfa.training.trainer import Trainer
 
-__all__ = ["run_training"]
+__all__ = ["SCORE", "Validate", "run_training"]
+
+#: The metric by which the best checkpoint is chosen; more is better.
+SCORE = "eval/validation/spl"
+
+#: Evaluation during a training, called at every line of the log with whether it is the last: metrics, the
+#: same names each time, NaN where none was due. :class:`vusfa.experiments.validation.Validation` is one.
+Validate = Callable[[bool], Mapping[str, float]]
 
 
 def run_training(
@@ -23,16 +34,19 @@ def run_training(
     stop: StopOnSignal,
     progress: ProgressLine,
     converged: Callable[[], bool] | None = None,
+    validate: Validate | None = None,
 ) -> None:
-    """Updates until ``total_frames``, convergence or a signal, with lines of the log and checkpoints.
+    """Update until ``total_frames``, convergence or a signal, with lines of the log and checkpoints.
 
     Args:
         trainer: new, or resumed.
-        checkpoint: file, written at intervals and at the end.
-        loggers: get metrics and checkpoints.
-        stop: looked at after each update.
+        checkpoint: file, written at intervals, where :data:`SCORE` is the best so far, and at the end;
+            ``best.pt`` beside it is a copy of the best.
+        loggers: receive metrics and checkpoints.
+        stop: checked after each update.
         progress: the live line.
-        converged: asked every ``early_stopping.every`` frames whether the training may end.
+        converged: called every ``early_stopping.every`` frames; whether the training may end.
+        validate: its metrics join those of the log.
 
     Raises:
         WorkerError, ResultError: a worker has died, or the system does not take a file. What was learned is
@@ -40,10 +54,10 @@ def run_training(
     """
     with trainer.collecting() as batches:
         try:
-            _run(trainer, batches, checkpoint, loggers, stop, progress, converged)
+            _run(trainer, batches, checkpoint, loggers, stop, progress, converged, validate)
         except (WorkerError, ResultError) as error:
             if not (stop.received and isinstance(error, WorkerError)):
-                raise _with_whereabouts(error, trainer, checkpoint) from error
+                raise _with_whereabouts(error, trainer, checkpoint, loggers) from error
             loggers.log_checkpoint(trainer.save(checkpoint), trainer.frames)  # the signal was theirs, too
 
 
@@ -55,9 +69,11 @@ def _run(
     stop: StopOnSignal,
     progress: ProgressLine,
     converged: Callable[[], bool] | None,
+    validate: Validate | None,
 ) -> None:
     total, log_every = trainer.settings["total_frames"], trainer.settings["log_every"]
     checkpoint_every = trainer.settings["checkpoint_every"]
+    saved = -1
     every, ended = trainer.settings["early_stopping"]["every"] if converged else total, False
     while trainer.frames < total and not stop.received and not ended:
         before = trainer.frames
@@ -66,18 +82,32 @@ def _run(
         ended = trainer.frames >= total  # a short training is logged, too
         if converged is not None and not ended and before // every < trainer.frames // every:
             ended = converged()
+        is_best = False
         if ended or before // log_every < trainer.frames // log_every:
-            metrics = trainer.metrics()
+            metrics = trainer.metrics() | ({} if validate is None else dict(validate(ended)))
             loggers.log_metrics(metrics, trainer.frames)
-            progress.rates(metrics["success"], metrics["length_ratio"])
-        if before // checkpoint_every < trainer.frames // checkpoint_every:
-            loggers.log_checkpoint(trainer.save(checkpoint), trainer.frames)
-    loggers.log_checkpoint(trainer.save(checkpoint), trainer.frames)
+            progress.rates(metrics, validated=validate is not None)
+            is_best = metrics.get(SCORE, math.nan) > trainer.validation["best"]
+        if is_best or before // checkpoint_every < trainer.frames // checkpoint_every:
+            if is_best:
+                trainer.validation["best"] = metrics[SCORE]
+            _save(trainer, checkpoint, loggers, is_best)
+            saved = trainer.frames
+    if saved != trainer.frames:
+        _save(trainer, checkpoint, loggers)
 
 
-def _with_whereabouts(error: VusfaError, trainer: Trainer, checkpoint: Path) -> VusfaError:
+def _save(trainer: Trainer, checkpoint: Path, loggers: Logger, is_best: bool = False) -> None:
+    trainer.save(checkpoint)
+    if is_best:
+        with replacing(checkpoint.with_name(BEST)) as unfinished:
+            shutil.copyfile(checkpoint, unfinished)
+    loggers.log_checkpoint(checkpoint, trainer.frames, is_best)
+
+
+def _with_whereabouts(error: VusfaError, trainer: Trainer, checkpoint: Path, loggers: Logger) -> VusfaError:
     try:
-        trainer.save(checkpoint)
+        loggers.log_checkpoint(trainer.save(checkpoint), trainer.frames)
         return type(error)(f"{error}; all {trainer.frames:,} frames are in {checkpoint}: resume it")
     except VusfaError:
         kept = f"{checkpoint} is as it was" if checkpoint.is_file() else "there is no checkpoint yet"

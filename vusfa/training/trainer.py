@@ -34,7 +34,7 @@ from vusfa.training.checkpoint import (
     save_checkpoint,
 )
 from vusfa.training.collectors import collector_state, load_collector_state, opened
-from vusfa.training.content import check_like, restore
+from vusfa.training.content import NO_VALIDATION, check_like, restore
 from vusfa.training.metrics import EpisodeMeter, MeanMeter
 from vusfa.training.optimization import descend, total_loss
 from vusfa.training.precision import resolve_autocast
@@ -70,6 +70,8 @@ class Trainer:
         episodes: how the episodes since the last line of the log ended.
         terms: means of the loss's terms since then.
         run_id: the same for all loggers and for all resumptions.
+        validation: of the evaluations during the training: best score, frames at the last one, seconds spent
+            in all and in the last, and the same of their media.
     """
 
     def __init__(
@@ -94,6 +96,7 @@ class Trainer:
         self._make_collector = partial(make_collector, self.acting)
         self.frames, self.updates, self.seconds = 0, 0, 0.0
         self.run_id = secrets.token_hex(4)
+        self.validation = dict(NO_VALIDATION)
         self.episodes, self.terms = EpisodeMeter(scenes, goals), MeanMeter()
         self._collector: BaseCollector | None = None
         self._waiting: tuple[str | Path, Mapping[str, Any]] | None = None  # a checkpoint, for the collector
@@ -199,6 +202,7 @@ class Trainer:
                 "updates": self.updates,
                 "seconds": self.seconds,
                 "run_id": self.run_id,
+                "validation": dict(self.validation),
                 "scenes": {
                     "sources": scene_sources(self.settings["scenes"], Path(path).parent),
                     "names": list(self.scenes.names),
@@ -253,6 +257,7 @@ class Trainer:
         restore(path, "rng", check_random_state, state["rng"])
         for name in ("frames", "updates", "seconds", "run_id"):
             setattr(self, name, state[name])
+        self.validation = dict(state["validation"])
         self._waiting = path, state
         return differences(state["config"], self.settings)
 

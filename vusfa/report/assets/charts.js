@@ -125,7 +125,10 @@ function drawDistance() {
 }
 
 const CURVES = {
-  success: "success (%)", length: "length of successful episodes (actions)", length_ratio: "length over shortest path",
+  "eval/trained/success": "success, trained goals (%)", "eval/validation/success": "success, validation goals (%)",
+  "eval/trained/spl": "SPL, trained goals (%)", "eval/validation/spl": "SPL, validation goals (%)",
+  "eval/trained/length_ratio": "length over shortest path, trained goals", "eval/validation/length_ratio": "length over shortest path, validation goals",
+  success: "success of the episodes that ended (%)", length: "length of successful episodes (actions)", length_ratio: "length over shortest path",
   collisions: "blocked actions (% of all)", explained_variance: "explained variance of the returns", entropy: "entropy of the policy (nats)",
   kl: "KL of the latent from N(0, 1) (nats)", loss_critic: "critic loss", loss_successor: "successor feature loss", hindsight_value: "value of hindsight goals", grad_norm: "gradient norm",
 };
@@ -141,10 +144,10 @@ function running(values, width) {
 
 function drawCurves() {
   const [measure, scene, axis, width] = [$("curve").value, $("curve-scene").value, $("curve-axis").value, Number($("smooth").value)];
-  const general = !["success", "length", "length_ratio"].includes(measure);
+  const general = !DATA.curves.some((item) => item.name.startsWith("scene/") && item.name.split("/").slice(2).join("/") === measure);
   $("curve-scene").disabled = general;
   const name = scene && !general ? `scene/${scene}/${measure}` : measure;
-  const factor = measure === "success" || measure === "collisions" ? 100 : 1;
+  const factor = /(^|\/)(success|spl|collisions)$/.test(measure) ? 100 : 1;
   const traces = [];
   for (const curve of DATA.curves.filter((item) => item.name === name && item.x.length)) {
     const x = axis === "x" ? curve.x : curve.minutes;
@@ -162,7 +165,7 @@ function drawCurves() {
   plot("curves", traces, {
     height: 400, hovermode: "x unified", showlegend: true,
     xaxis: { title: axis === "x" ? "frames (actions of all environments)" : "minutes of training", rangemode: "tozero", hoverformat: axis === "x" ? ",.0f" : ".1f" },
-    yaxis: { title: CURVES[measure] || measure, rangemode: "tozero", type: measure === "length_ratio" ? "log" : "linear", ticksuffix: factor === 100 ? " %" : "" },
+    yaxis: { title: CURVES[measure] || measure, rangemode: "tozero", type: measure.endsWith("length_ratio") ? "log" : "linear", ticksuffix: factor === 100 ? " %" : "" },
   });
 }
 
@@ -191,7 +194,7 @@ function startCharts() {
   fill($("scene"), [...scenes].sort((a, b) => b.startsWith("mean of") - a.startsWith("mean of")).map((name) => [name, words(name)]));
   fill($("distance-measure"), SHOWN.filter(isShare).map((name) => [name, titleOf(name)]));
   const curves = [...new Set(DATA.curves.map((curve) => curve.name))];
-  fill($("curve"), curves.filter((name) => !name.includes("/")).map((name) => [name, CURVES[name] || name]));
+  fill($("curve"), curves.filter((name) => !name.startsWith("scene/")).map((name) => [name, CURVES[name] || name]));
   const curveScenes = [...new Set(curves.filter((name) => name.startsWith("scene/")).map((name) => name.split("/")[1]))];
   fill($("curve-scene"), [["", "all scenes"], ...curveScenes.map((name) => [name, words(name)])]);
   for (const [ids, draw, wanted] of [
