@@ -167,8 +167,8 @@ class EvaluationSettings:
 
     goals: Any
     episodes_per_goal: int
+    interval: Any
     max_steps: int = MAX_STEPS
-    interval: Any = "auto"
 
 
 @dataclass

@@ -24,7 +24,7 @@ def checkpoints(folder: Path, overrides: list[str], stages: list[float]) -> list
 
     With ``early_stopping.success`` the only checkpoint is the one that the training ended with.
     """
-    cfg = compose_settings([*overrides, f"folder={folder}", "evaluation=none"])
+    cfg = compose_settings([*overrides, f"folder={folder}", "evaluation.goals=null"])
     if cfg.early_stopping.success is not None:
         stages = stages[-1:]
     # interpolated now: schedules end where the whole training ends, whichever part of it runs

@@ -11,8 +11,8 @@ from omegaconf import DictConfig, OmegaConf
 
 from vusfa.conf.compose import compose
 from vusfa.conf.schema import register_schema
-from vusfa.evaluation import Comparison, check_comparison, compare, evaluate, print_summary
-from vusfa.experiments.measure import evaluation_policy, evaluation_precision
+from vusfa.evaluation import Comparison, check_comparison, compare, print_summary
+from vusfa.experiments.measure import measure_goals
 from vusfa.experiments.validation import Draw, Validation
 from vusfa.files import say
 from vusfa.training import (
@@ -128,18 +128,8 @@ def train(settings: Mapping[str, Any], overrides: Sequence[str] = (), draw: Draw
 def _converged(trainer: Trainer) -> bool:
     """Whether enough of the episodes to the trained goals arrive; prints how many."""
     chosen = trainer.settings["early_stopping"]
-    with evaluation_precision(trainer.agent, trainer.settings):
-        episodes = evaluate(
-            evaluation_policy(trainer.agent),
-            trainer.scenes,
-            trainer.goals,
-            episodes_per_goal=chosen["episodes_per_goal"],
-            max_steps=chosen["max_steps"],
-            history=trainer.agent.config["history"],
-            seed=trainer.frames,
-            observe=trainer.observation,
-        )
-    success = episodes.success.double().mean().item()
+    limits = {name: chosen[name] for name in ("episodes_per_goal", "max_steps")}
+    success = measure_goals(trainer, trainer.goals.unique(), **limits).success.nanmean().item()
     say(
         f"after {trainer.frames:,} frames {100 * success:.1f} % of the episodes to the trained goals arrive"
         f" within {chosen['max_steps']} steps"

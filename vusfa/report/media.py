@@ -29,8 +29,9 @@ def draw_media(trainer: Trainer, success: Tensor, goals: Tensor) -> dict[str, by
         goals: (G,) global ids of the validation goals.
 
     Returns:
-        ``eval/walk``, a GIF of the first 40 actions of the longest of the shortest paths to a goal in the
-        first scene; ``eval/floor/SCENE``, a PNG of success by place, of at most eight scenes.
+        ``eval/walk``, a GIF of the first 40 actions of a walk in the first scene, from the state that is
+        farthest from a goal to that goal; ``eval/floor/SCENE``, a PNG of success by place, of at most eight
+        scenes.
 
     >>> from vusfa.experiments.training import compose_settings
     >>> from vusfa.training import make_trainer
@@ -41,7 +42,6 @@ def draw_media(trainer: Trainer, success: Tensor, goals: Tensor) -> dict[str, by
     """
     scenes = trainer.scenes.to(next(trainer.agent.parameters()).device)
     start, goal = farthest_pair(scenes, int(scenes.scene_id[int(goals[0])]), goals=goals.to(scenes.device))
-    media = {}
     (trail,) = trails(
         InferencePolicy(trainer.agent),
         scenes,
@@ -51,7 +51,7 @@ def draw_media(trainer: Trainer, success: Tensor, goals: Tensor) -> dict[str, by
         history=trainer.agent.config["history"],
         observe=trainer.observation,
     )
-    media["eval/walk"] = encode_gif(draw_film(scenes, trail, goal, scale=1))
+    media = {"eval/walk": encode_gif(draw_film(scenes, trail, goal, scale=1))}
     for index, scene in enumerate(scenes.scenes[:SCENES]):
         first = int(scenes.offsets[index])
         last = first + scene.num_states
