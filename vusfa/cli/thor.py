@@ -34,11 +34,9 @@ def export_thor(
         bool, typer.Option("--headless", help="Render without a display (the simulator's CloudRendering).")
     ] = False,
     backbone: Annotated[
-        str, typer.Option(help="efficientnet-lite0, torchvision:MODEL, timm:MODEL, a .pt or an .onnx file.")
+        str, typer.Option(help="Network that computes the features; see `vusfa scenes encode --help`.")
     ] = "efficientnet-lite0",
-    weights: Annotated[
-        Path | None, typer.Option(help="State dict of a torchvision or timm model, a file.")
-    ] = None,
+    weights: Annotated[Path | None, typer.Option(help="Its weights, where they are a file of yours.")] = None,
     layer: Annotated[str | None, typer.Option(help="Layer whose output is taken, such as avgpool.")] = None,
     crops: Annotated[str | None, typer.Option(help="whole (squashed), centre, or ten.")] = None,
     batch: Annotated[int, typer.Option(min=1, help="Pictures encoded at a time.")] = 32,

