@@ -20,6 +20,7 @@ from torch import Tensor
 from vusfa.errors import SceneError
 from vusfa.limits import TABLE_STATES
 from vusfa.scenes import store
+from vusfa.scenes.arrays import from_arrays
 from vusfa.scenes.graph import as_states, default_actions, weak_components
 from vusfa.scenes.paths import ShortestPaths
 from vusfa.scenes.pictures import read_pictures
@@ -165,6 +166,8 @@ class Scene:
                     f" check the name"
                 )
         return cls.load(source)
+
+    from_arrays = classmethod(from_arrays)
 
     def save(
         self, path: str | os.PathLike[str], pictures: Tensor | np.ndarray | Sequence[bytes] | None = None
