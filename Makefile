@@ -6,7 +6,7 @@ STAMP := $(VENV)/.installed-dev
 RENDER := $(VENV)/.installed-render
 DOCS := $(VENV)/.installed-docs
 
-.PHONY: demo docs faults test lint typecheck clean help
+.PHONY: demo dist docs faults test lint typecheck clean help
 
 help:  ## list the targets
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/'
@@ -35,6 +35,14 @@ demo: $(STAMP)  ## train VUSFA in the bundled bathroom, evaluate it, film one wa
 docs: $(DOCS)  ## build the documentation site into docs/_build/html; a warning is an error, tutorials are executed
 	$(BIN)/python -m sphinx -W --keep-going -q -b html docs docs/_build/html
 
+dist: pyproject.toml  ## build the wheel and the sdist into dist, and check their metadata, contents and sizes
+	rm -rf dist build
+	$(PYTHON) -m venv $(VENV)-dist
+	$(VENV)-dist/bin/python -m pip install --quiet build twine
+	$(VENV)-dist/bin/python -m build --outdir dist .
+	$(VENV)-dist/bin/python -m twine check --strict dist/*
+	.ci/check-dist dist
+
 lint: $(STAMP)  ## ruff: rules and format
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
@@ -49,4 +57,4 @@ faults: $(STAMP)  ## the long form of the suites of faults, half an hour; writes
 	$(BIN)/python tests/faults/long.py $(FAULTS)
 
 clean:  ## remove the virtual environment and everything built
-	rm -rf $(VENV) build dist docs/_build docs/api *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	rm -rf $(VENV) $(VENV)-dist build dist docs/_build docs/api *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis

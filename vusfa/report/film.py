@@ -138,7 +138,7 @@ def draw_film(scenes: SceneSet, trail: Sequence[int], goal: int, scale: int = 2)
         picture = Image.new("RGB", (drawn.width, drawn.height + _TITLE_HEIGHT), _PAPER)
         picture.paste(drawn, (0, _TITLE_HEIGHT))
         draw = ImageDraw.Draw(picture)
-        words = dict(panels, map=f"step {step}, shortest path {shortest}")
+        words = dict(panels, map=f"step {step}, shortest {shortest}")
         left = 0
         for panel, title in words.items():
             draw.text((left + 2, 3), title, fill=_INK, font=ImageFont.load_default(14))

@@ -19,6 +19,7 @@ from vusfa.report.result_tables import (
     model_rows,
     run_rows,
 )
+from vusfa.report.success_plot import draw_success
 from vusfa.report.unseen import unseen_table
 from vusfa.scenes import SceneSet
 from vusfa.training import set_threads
@@ -34,6 +35,7 @@ def print_tables(
     results: Path = Path("results"),
     out: Path | None = None,
     docs: Path | None = None,
+    plot: Path | None = None,
     scenes: list[str] | None = None,
     resamples: int = 2000,
     threads: int = 1,
@@ -48,6 +50,7 @@ def print_tables(
         results: where they lie.
         out: folder for the CSV files; RESULTS/tables when not given.
         docs: write the tables that the documentation shows to this folder (docs/generated), and print none.
+        plot: draw success to trained and to unseen goals as PNG.
         scenes: bundled names and files, in order; the bundled rooms that the runs name when not given.
         resamples: of the bootstrap.
         threads: processor threads; more than 1 pays on an idle machine only.
@@ -61,10 +64,12 @@ def print_tables(
     else:
         folder = check_folder(out or results / "tables", "out")
         world = SceneSet.open(scenes) if scenes else None
-        _print(read_experiment(results, experiments, world), folder, resamples)
+        if plot is not None:
+            check_folder(plot.absolute().parent, "plot")
+        _print(read_experiment(results, experiments, world), folder, resamples, plot)
 
 
-def _print(experiment: Experiment, folder: Path, resamples: int) -> None:
+def _print(experiment: Experiment, folder: Path, resamples: int, plot: Path | None) -> None:
     names = ["model", "seeds", "num_goals", *columns()]
     runs = run_rows(experiment)
     heads = ["model", "seed", "frames", "checkpoint", "training_s", "trained", "solved", "exact_z"]
@@ -90,6 +95,9 @@ def _print(experiment: Experiment, folder: Path, resamples: int) -> None:
         far += distance_rows(experiment, mode, resamples)
         middle += middle_rows(experiment, mode, resamples)
         compared += comparison_rows(experiment, mode, resamples)
+    if plot is not None:
+        chosen = [row for row in every if (row["mode"], row["scene"]) == ("sampled", MEAN_OF_STATES)]
+        print(draw_success(chosen, plot), file=sys.stderr)
     drawn = [[row for row in rows if row["mode"] == "sampled"] for rows in (far, middle, compared)]
     _show("By actions from the nearest trained goal, actions drawn", drawn[0], ["distance", *names])
     _show("Interquartile mean over seeds and scenes, actions drawn", drawn[1], ["goals", *names])
