@@ -52,6 +52,7 @@ def resumed_settings(given: Mapping[str, Any], overrides: Sequence[str]) -> dict
         if name.startswith("~") or name.lstrip("+") == "preset":
             raise ConfigError(f"{name} cannot be given beside resume; give the settings themselves")
         _copy(given, settings, name.lstrip("+").split("."))
+    settings["resume"] = str(path)
     for group in ("optim", "entropy"):
         origin = given if group in names else stored
         if origin[group]["horizon"] == origin["total_frames"] and f"{group}.horizon" not in names:
