@@ -300,7 +300,7 @@ class _Patches(nn.Module):
     def forward(self, images: Tensor) -> Tensor:
         found = self.network.forward_features(images)  # type: ignore[operator]
         if found.ndim == 3:  # tokens, the class and the registers first
-            found = found[:, self.network.num_prefix_tokens :].transpose(1, 2).unsqueeze(3)  # type: ignore[misc]
+            found = found[:, self.network.num_prefix_tokens :].transpose(1, 2).unsqueeze(3)
         return found
 
 
