@@ -61,7 +61,7 @@ def plot_curve(
     if random_walk is not None:
         upper.axhline(100 * random_walk, color="#888888", linestyle="--", label="random walk")
     if evaluated or random_walk is not None:
-        upper.legend(loc="lower right", frameon=False)
+        upper.legend(loc="best", frameon=False)
     lower.axhline(1.0, color="#888888", linestyle="--", label="shortest path")
     lower.set_yscale("log")
     lower.set_ylabel("length / shortest")

@@ -75,8 +75,8 @@ class WandbLogger:
 
     All metrics have the frames as their step. Online, rows are sent at once; of a resumed run, those that W&B
     has already are left out. Offline, rows wait for the next checkpoint: a run that is killed has logged what
-    its checkpoint holds, and resuming, which begins another offline folder of the same id, goes on from
-    there. ``wandb sync`` joins the folders.
+    its checkpoint holds (but for wandb's last half second), and resuming, which begins another offline folder
+    of the same id, goes on from there. ``wandb sync`` joins the folders.
 
     Args:
         folder: of wandb's files.
@@ -119,6 +119,8 @@ class WandbLogger:
         # Artifacts wait in a staging folder to be sent. By default that is in HOME; keep a run's files
         # together.
         os.environ.setdefault("WANDB_DATA_DIR", str(Path(folder).resolve()))
+        # By default wandb writes what it was told every 15 seconds, and a killed run loses that.
+        os.environ.setdefault("WANDB_X_TRANSACTION_LOG_FLUSH_INTERVAL", "0.5")
         self._wandb = wandb
         try:
             self.run = wandb.init(

@@ -143,7 +143,9 @@ function running(values, width) {
 }
 
 function drawCurves() {
-  const [measure, scene, axis, width] = [$("curve").value, $("curve-scene").value, $("curve-axis").value, Number($("smooth").value)];
+  const [measure, scene, axis] = [$("curve").value, $("curve-scene").value, $("curve-axis").value];
+  $("smooth").disabled = measure.startsWith("eval/");  // few points, and exact
+  const width = $("smooth").disabled ? 1 : Number($("smooth").value);
   const general = !DATA.curves.some((item) => item.name.startsWith("scene/") && item.name.split("/").slice(2).join("/") === measure);
   $("curve-scene").disabled = general;
   const name = scene && !general ? `scene/${scene}/${measure}` : measure;
