@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import io
 import math
 from collections.abc import Callable
 from pathlib import Path
@@ -11,16 +12,19 @@ from typing import Any
 import pytest
 import torch
 from omegaconf import OmegaConf
+from PIL import Image
 
 from vusfa.cli.launch import compose
+from vusfa.errors import ResultError, SceneError
 from vusfa.evaluation.exact import exact_goals, expected_walks, sampled_walks, uniform_probabilities
 from vusfa.evaluation.navigation import evaluate
 from vusfa.experiments import training as training_module
 from vusfa.experiments.training import train
 from vusfa.experiments.validation import Validation
 from vusfa.modules import InferencePolicy, TabularPolicy
+from vusfa.report.media import draw_media
 from vusfa.scenes import SceneSet
-from vusfa.training import load_checkpoint, make_loggers, make_trainer
+from vusfa.training import Trainer, load_checkpoint, make_loggers, make_trainer
 from vusfa.training.run import SCORE
 
 Made = Callable[..., dict[str, Any]]
@@ -206,3 +210,47 @@ def test_no_advice_above_it_and_without_evaluation(
     validation = Validation(make_trainer(made()), make_loggers([], "run", {}, run_id="a"))
     validation.latest = {f"eval/{name}/success": 1.0 for name in ("trained", "validation")}
     assert validation.advice() is None
+
+
+def test_a_full_disk_leaves_the_checkpoint_and_no_part_of_the_best(
+    made: Made, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(source: Path, target: Path) -> None:
+        Path(target).write_bytes(b"half")
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("shutil.copyfile", full)
+    with pytest.raises(ResultError, match=r"best\.pt: cannot be written \(No space left on device\)"):
+        train(made("evaluation.interval=24", "total_frames=48"))
+    assert not list((tmp_path / "run").glob(".best*"))
+    assert not (tmp_path / "run" / "best.pt").exists()
+    assert load_checkpoint(tmp_path / "run" / "checkpoint.pt")["frames"] == 24
+
+
+@pytest.mark.parametrize("error", [SceneError("hall.h5: no such file"), OSError(5, "Input/output error")])
+def test_pictures_that_cannot_be_drawn_end_no_training(
+    made: Made, error: Exception, capsys: pytest.CaptureFixture[str]
+) -> None:
+    asked: list[int] = []
+
+    def draw(trainer: Trainer, *_: torch.Tensor) -> dict[str, bytes]:
+        asked.append(trainer.frames)
+        raise error
+
+    settings = made("evaluation.interval=24", "total_frames=72", "logger=tensorboard")
+    assert train(settings, [], draw).exit_code == 0
+    assert asked == [24]
+    assert "warning: films and maps cannot be drawn" in capsys.readouterr().err
+
+
+def test_media_show_the_floor_by_place_and_a_walk(validation: Validation) -> None:
+    trainer, goals = validation._trainer, torch.tensor([5])
+    before = torch.get_rng_state()
+    media = draw_media(trainer, (torch.arange(16) < 4).double(), goals)  # success from the first place only
+    assert torch.equal(before, torch.get_rng_state())
+    floor = Image.open(io.BytesIO(media["eval/floor/hall"])).convert("RGB")
+    dark, light = floor.getpixel((100, 200)), floor.getpixel((200, 100))  # lower left, upper right
+    assert sum(dark) < 200
+    assert sum(light) > 600
+    with Image.open(io.BytesIO(media["eval/walk"])) as film:
+        assert 2 <= film.n_frames <= 41

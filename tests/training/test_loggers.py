@@ -146,6 +146,21 @@ def test_tensorboard(tmp_path: Path):
         assert image.encoded_image_string == data
 
 
+@pytest.mark.filterwarnings("default")
+def test_tensorboard_shows_no_frame_twice_after_a_kill(tmp_path: Path):
+    for resumed, numbers in ((None, (10, 20, 30)), (20, (30, 40))):
+        log = TensorBoardLogger(tmp_path, CONFIG, resumed)
+        for frames in numbers:
+            log.log_metrics({"kl": float(resumed or 0)}, frames)
+        log.close()
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    events = EventAccumulator(str(tmp_path))
+    events.Reload()
+    shown = [(event.step, event.value) for event in events.Scalars("train/kl")]
+    assert shown == [(10, 0.0), (20, 0.0), (30, 20.0), (40, 20.0)]
+
+
 @pytest.fixture
 def wandb_at_home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """wandb keeps to the test's folder."""

@@ -18,7 +18,7 @@ __all__ = ["compose", "default_settings"]
 
 
 def compose(folder: Path = FOLDER, name: str = "train", overrides: Sequence[str] = ()) -> DictConfig:
-    """The configuration as the command line would make it, without running anything.
+    """Compose the configuration as the command line would, without running anything.
 
     Args:
         folder: of the configuration files.

@@ -35,7 +35,7 @@ def schema() -> DictConfig:
 
 
 def register_schema() -> None:
-    """Gives Hydra's ConfigStore the types, as ``settings``, and the group ``algorithm``."""
+    """Register the types with Hydra's ConfigStore as ``settings``, and the group ``algorithm``."""
     store = ConfigStore.instance()
     store.store(name="settings", node=schema())
     for name, settings in ALGORITHMS.items():
@@ -43,8 +43,8 @@ def register_schema() -> None:
 
 
 def check_overrides(overrides: Sequence[str]) -> None:
-    """Refuses another word than true or false for a setting that is one of these two: OmegaConf would take
-    ``off``, ``no`` and ``0`` as well.
+    """Refuse anything but true and false for a boolean setting: OmegaConf would accept ``off``, ``no`` and
+    ``0`` as well.
 
     Args:
         overrides: of the command line, ``setting=value``.
@@ -68,7 +68,7 @@ def check_overrides(overrides: Sequence[str]) -> None:
 
 
 def validated(settings: Mapping[str, Any], where: str = "") -> dict[str, Any]:
-    """Plain settings, after a check of names, types and ranges.
+    """Check names, types and ranges of settings.
 
     Args:
         settings: plain or OmegaConf's, all of them.
@@ -105,7 +105,7 @@ def validated(settings: Mapping[str, Any], where: str = "") -> dict[str, Any]:
 
 
 def mistake(error: BaseException) -> str | None:
-    """One line for an error of OmegaConf's about a setting, or about one that Hydra found while composing."""
+    """Describe in one line an error of OmegaConf's, or of Hydra's while composing, about a setting."""
     while error is not None:
         key = getattr(error, "full_key", None)
         if isinstance(error, ConfigKeyError) or type(error).__name__ == "ConfigAttributeError":

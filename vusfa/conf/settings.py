@@ -49,7 +49,7 @@ POSITIVE = (
 
 @dataclass
 class EnvSettings:
-    """Of :class:`vusfa.envs.TargetNavEnv`; goals and crop may be of several types."""
+    """Settings of :class:`vusfa.envs.TargetNavEnv`; goals and crop may be of several types."""
 
     goals: Any
     goal_sampling: str
@@ -62,7 +62,7 @@ class EnvSettings:
 
 @dataclass
 class AgentSettings:
-    """Of :func:`vusfa.modules.make_agent`; null leaves a field to the architecture."""
+    """Settings of :func:`vusfa.modules.make_agent`; null leaves a field to the architecture."""
 
     model: str
     architecture: str
@@ -91,8 +91,8 @@ class AgentSettings:
 
 @dataclass
 class ObjectiveSettings:
-    """Of USFLoss, USFEstimator and DualAscent of :mod:`vusfa.objectives`, and coefficients of further
-    terms."""
+    """Settings of USFLoss, USFEstimator and DualAscent of :mod:`vusfa.objectives`, and coefficients of
+    further terms."""
 
     objective_coeff: float
     critic_coeff: float
@@ -127,7 +127,7 @@ class HindsightSettings:
 
 @dataclass
 class OptimSettings:
-    """Of :func:`vusfa.training.make_optimizer`."""
+    """Settings of :func:`vusfa.training.make_optimizer`."""
 
     kind: str
     lr: float
@@ -138,7 +138,7 @@ class OptimSettings:
 
 @dataclass
 class CollectorSettings:
-    """Of :func:`vusfa.training.make_collector`."""
+    """Settings of :func:`vusfa.training.make_collector`."""
 
     kind: str
     num_envs: int
@@ -149,7 +149,7 @@ class CollectorSettings:
 
 @dataclass
 class LoggerSettings:
-    """Of :func:`vusfa.training.make_loggers`."""
+    """Settings of :func:`vusfa.training.make_loggers`."""
 
     kinds: list[str]
     project: str
@@ -162,8 +162,8 @@ class LoggerSettings:
 
 @dataclass
 class EvaluationSettings:
-    """Of the evaluation at the end, whose goals may be a word, a list of ids, or null; and of those during
-    the training, whose interval is ``"auto"``, a number of frames, or null."""
+    """Settings of the evaluation at the end, whose goals may be a word, a list of ids, or null; and of those
+    during the training, whose interval is ``"auto"``, a number of frames, or null."""
 
     goals: Any
     episodes_per_goal: int

@@ -17,10 +17,12 @@ from torch import Tensor
 
 from vusfa.envs.dynamics import MAX_STEPS
 from vusfa.envs.goals import resolve_goals
+from vusfa.errors import VusfaError
 from vusfa.evaluation.baselines import random_walk
 from vusfa.evaluation.exact import ExpectedWalks
 from vusfa.experiments.manifest import draw_goals
 from vusfa.experiments.measure import measure_goals
+from vusfa.files import say
 from vusfa.training import Trainer
 from vusfa.training.loggers import Logger
 
@@ -98,7 +100,11 @@ class Validation:
         is_last = trainer.frames >= trainer.settings["total_frames"]
         if self._draw and self._loggers.shows_media and (is_last or self._can_afford("media_")):
             began, goals = time.monotonic(), self.goals[self.subsets["validation"]]
-            self._loggers.log_media(self._draw(trainer, walks.from_start, goals), trainer.frames)
+            try:
+                self._loggers.log_media(self._draw(trainer, walks.from_start, goals), trainer.frames)
+            except (VusfaError, OSError) as error:  # pictures that have gone end no training
+                say(f"warning: films and maps cannot be drawn ({error}); the run goes on without them")
+                self._draw = None
             self._spent("media_", began)
         trainer.validation["frames"] = trainer.frames
         return self.latest

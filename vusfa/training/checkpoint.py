@@ -136,7 +136,7 @@ def load_checkpoint(path: str | Path, device: torch.device | str = "cpu") -> dic
 
 
 def check_setting(path: str | Path, name: str, saved: Any, wanted: Any) -> None:
-    """Check that a checkpoint was saved with a setting's value of now.
+    """Check that a checkpoint was saved with a setting's present value.
 
     >>> check_setting("a.pt", "agent.model", "usfa", "vusfa")
     Traceback (most recent call last):
@@ -184,7 +184,7 @@ def check_fits(
 
 
 def differences(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
-    """Settings that differ, one line each.
+    """Describe the settings that differ, one line each.
 
     >>> differences({"optim": {"lr": 0.1}}, {"optim": {"lr": 0.2}})
     ['optim.lr=0.2 instead of 0.1']
@@ -261,7 +261,7 @@ def load_weights(agent: Agent, state: Mapping[str, Any], path: str | Path) -> No
 
 
 def load_optimizer(optimizer: torch.optim.Optimizer, state: Mapping[str, Any], path: str | Path) -> None:
-    """The optimizer's memory of gradients; its numbers stay as they are.
+    """Load the optimizer's moments; its learning rate and options stay as they are.
 
     Raises:
         CheckpointError: it is another optimizer's, or not of these parameters' shapes.

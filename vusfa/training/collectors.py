@@ -123,7 +123,7 @@ def make_collector(
     autocast: bool = False,
     timeout: float | None = None,
 ) -> BaseCollector:
-    """Collector without an end; the caller counts frames.
+    """Make a collector that never ends; the caller counts the frames.
 
     Args:
         kind: ``"single"``, ``"multi_sync"`` or ``"multi_async"``.
@@ -132,7 +132,7 @@ def make_collector(
         num_envs: environments in all.
         rollout: steps T of each environment in a batch; ``single`` and ``multi_sync`` give batches of
             num_envs x T frames, ``multi_async`` of num_envs / num_workers x T.
-        num_workers: processes, of the two kinds that have some.
+        num_workers: worker processes, of the two ``multi_`` kinds.
         seed: of the environments and the workers' draws of actions.
         autocast: workers compute in bfloat16 where that is safe; in this process the caller decides, by
             collecting within :class:`torch.autocast`.
@@ -179,9 +179,9 @@ def make_collector(
 
 @contextmanager
 def opened(make: Callable[[], BaseCollector]) -> Iterator[BaseCollector]:
-    """A collector within a context that ends its processes.
+    """Context manager of a collector, whose processes end with the context.
 
-    A collector with workers changes this process's number of threads; that is put right.
+    A collector with workers changes this process's number of threads, which is restored.
     """
     threads = torch.get_num_threads()
     try:
@@ -227,7 +227,7 @@ def load_collector_state(
     """Restore what :func:`collector_state` gave; nothing for a collector with workers.
 
     Args:
-        collector: begun, or new.
+        collector: new, or one that has collected.
         state: of a collector of the same kind and settings.
         path: of the checkpoint, for messages.
 

@@ -105,7 +105,7 @@ def read_content(path: Path, device: torch.device | str) -> Any:
 
 
 def _damaged_record(path: Path, size: int) -> str | None:
-    """What is wrong with an archive's records."""
+    """Fault of an archive's records, or None."""
     with BoundedZip(path) as archive:
         records = archive.infolist()
         if len({record.filename for record in records}) < len(records):
@@ -120,7 +120,7 @@ def _damaged_record(path: Path, size: int) -> str | None:
 
 
 class _Copy:
-    """Copies content out of the mapped file, and refuses what no checkpoint holds."""
+    """Copy of the mapped file's content, which refuses what no checkpoint holds."""
 
     def __init__(self, path: Path, device: torch.device) -> None:
         self.path, self.device, self.left = path, device, limits.MAX_CHECKPOINT_VALUES
@@ -225,7 +225,7 @@ def check_like(path: str | Path, where: str, found: Any, expected: Any) -> None:
 
 
 def restore(path: str | Path, where: str, load: Callable[[Any], object], state: Any) -> None:
-    """Hand an entry to what restores it; whatever that cannot take is an error of the file.
+    """Restore an entry; whatever its ``load`` raises becomes an error of the file.
 
     Raises:
         CheckpointError: naming the entry.

@@ -1,4 +1,4 @@
-"""Folder of a run: one process writes to it, no run is overwritten unasked, nothing of a dead one stays."""
+"""Folder of a run: one process writes to it, no run is overwritten unasked, leftovers are removed."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ _LOCK = ".lock"
 
 
 def default_folder(settings: Mapping[str, Any]) -> Path:
-    """Folder of a run that was given none: preset, model, scenes, seed, and the time.
+    """Default folder of a run, named after preset, model, scenes, seed and time.
 
     >>> settings = {"name": "fast", "agent": {"model": "gvf"}, "scenes": ["bathroom", "x/y.h5"], "seed": 3}
     >>> str(default_folder(settings).parent)
@@ -56,7 +56,7 @@ def found_checkpoint(folder: str | Path | None) -> str | None:
 
 
 class RunFolder:
-    """Context in which this process alone writes to a run's folder.
+    """Context manager that gives this process exclusive use of a run's folder.
 
     Args:
         path: the folder; None for :func:`default_folder`, which no other run gets.
@@ -115,7 +115,7 @@ class RunFolder:
                 raise ConfigError(f"folder is '{self.path}': {error.strerror}; give another") from error
 
     def _claim(self) -> None:
-        """Takes the lock; it goes with this process, however that ends."""
+        """Take the lock, which ends with this process in any case."""
         self._lock = os.open(self.path / _LOCK, os.O_RDWR | os.O_CREAT, 0o644)
         try:
             fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)

@@ -87,7 +87,7 @@ class HogwildTrainer(Trainer):
             workers.close()
 
     def update(self, batches: Iterator[Any]) -> tuple[TensorDictBase, dict[str, Tensor]]:
-        """Takes note of one update of some worker.
+        """Record one update of a worker.
 
         Args:
             batches: those of :meth:`collecting`.
@@ -112,7 +112,7 @@ class HogwildTrainer(Trainer):
 
 
 class _Workers:
-    """Processes that train, and their reports."""
+    """Worker processes, and their reports."""
 
     patience = PATIENCE
 

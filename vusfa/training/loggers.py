@@ -220,7 +220,7 @@ def make_loggers(
     """
     makers: dict[str, Callable[[], Logger]] = {
         "csv": lambda: CSVLogger(folder, config, resume_frames),
-        "tensorboard": lambda: TensorBoardLogger(Path(folder) / "tensorboard", config),
+        "tensorboard": lambda: TensorBoardLogger(Path(folder) / "tensorboard", config, resume_frames),
         "wandb": lambda: WandbLogger(folder, config, run_id, project, mode, name, entity, group, tags),
     }
     for kind in kinds:

@@ -15,12 +15,12 @@ _MMAP_THRESHOLD, _TRIM_THRESHOLD = (-3, 32 * 2**20), (-1, 2**31 - 1)
 def keep_memory() -> bool:
     """Have the C library keep freed memory for the next tensors.
 
-    As it comes, glibc hands large blocks back to the system at once, and the system fills new ones with zeros
-    page by page: of an update's time a tenth or more. The process then holds on to the most that it ever
-    used.
+    By default glibc returns large blocks to the system at once, and the system fills new ones with zeros page
+    by page, which takes a tenth of an update's time or more. The process then keeps the most memory that it
+    ever used.
 
     Returns:
-        whether it could be asked; only glibc can.
+        whether the C library could be set so; only glibc can.
 
     >>> keep_memory() in (True, False)
     True

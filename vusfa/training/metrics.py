@@ -67,7 +67,7 @@ class EpisodeMeter:
         self._sums.index_add_(1, column, torch.stack(rows))
 
     def add(self, state: Mapping[str, Tensor]) -> None:
-        """Adds the sums of another meter for the same goals, its :meth:`state_dict`."""
+        """Add the sums of another meter for the same goals, its :meth:`state_dict`."""
         self._sums += state["sums"]
         self._frames += int(state["frames"])
         self._collisions += state["collisions"].to(torch.int64)
@@ -112,7 +112,7 @@ class EpisodeMeter:
 
 
 class MeanMeter:
-    """Means since the last :meth:`flush` of numbers that every update gives, such as the terms of a loss.
+    """Means, since the last :meth:`flush`, of numbers that every update gives, such as a loss's terms.
 
     >>> meter = MeanMeter()
     >>> meter.update({"kl": torch.tensor(0.5)})

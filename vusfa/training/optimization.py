@@ -1,4 +1,4 @@
-"""The optimizer: by name, and one step of it."""
+"""Construction of an optimizer by name, and one optimization step."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def total_loss(terms: Mapping[str, Tensor]) -> Tensor:
 def descend(
     optimizer: torch.optim.Optimizer, total: Tensor, lr: float, max_grad_norm: float | None
 ) -> Tensor:
-    """One step of the optimizer down the gradient of ``total``.
+    """Make one optimization step against the gradient of ``total``.
 
     Args:
         optimizer: holds the parameters.
@@ -63,18 +63,18 @@ def make_optimizer(
     threads: int | None = None,
     **options: Any,
 ) -> torch.optim.Optimizer:
-    """An optimizer by name.
+    """Make an optimizer by name.
 
     Args:
         params: of the agent.
         kind: ``"adam"``, ``"rmsprop"`` (torch's), ``"tf_rmsprop"`` (:class:`~vusfa.objectives.TFRMSprop`) or
             ``"a3c_rmsprop"`` (:class:`~vusfa.objectives.A3CRMSprop`).
         lr: learning rate at the start.
-        max_grad_norm: the latter two clip by themselves, every tensor on its own; the others leave it
-            to the caller, who clips all tensors as one.
+        max_grad_norm: norm that the latter two clip every tensor to; with the others the caller clips all
+            tensors as one vector.
         threads: of ``a3c_rmsprop``, see :func:`~vusfa.algorithms.threads_per_step`.
-        options: further arguments of the optimizer; ``threads_per_update``, which ``threads`` has taken into
-            account, is none.
+        options: further arguments of the optimizer; ``threads_per_update`` is ignored, because ``threads``
+            accounts for it.
 
     Raises:
         ConfigError: unknown kind or argument.

@@ -26,7 +26,7 @@ REPEATS = 5
 
 
 def resolve_autocast(setting: bool | Literal["auto"], device: torch.device | str = "cpu") -> bool:
-    """The setting ``autocast`` as true or false.
+    """Resolve the setting ``autocast`` to true or false.
 
     ``"auto"`` means bfloat16 where the hardware has units for it and, on a processor, a product of the
     network's size is faster with them. That is measured once per process, in a few milliseconds.
@@ -56,7 +56,7 @@ def resolve_autocast(setting: bool | Literal["auto"], device: torch.device | str
 
 
 def describe_autocast(enabled: bool, *, decided: bool) -> str:
-    """The precision of a run, as its first line.
+    """Describe the precision of a run, for its first line.
 
     Args:
         enabled: whether products are computed in bfloat16.
@@ -69,7 +69,7 @@ def describe_autocast(enabled: bool, *, decided: bool) -> str:
 
 
 def precision_name(enabled: bool) -> str:
-    """The number format of the products."""
+    """Name of the number format of the products."""
     return "bfloat16" if enabled else "float32"
 
 

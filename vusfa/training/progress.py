@@ -20,7 +20,7 @@ __all__ = ["EvaluationProgress", "ProgressLine", "describe"]
 
 
 class ProgressLine:
-    """Line that is rewritten on a terminal; elsewhere (a file, a pipe) a new line at intervals.
+    """Progress line, rewritten in place on a terminal, printed at intervals to a file or a pipe.
 
     Args:
         total: frames at which the training ends, or another total.
@@ -73,7 +73,7 @@ class ProgressLine:
         self._unseen = _or(metrics.get(unseen, math.nan), self._unseen)
 
     def update(self, frames: int) -> None:
-        """Set how many are done."""
+        """Set the number of frames done."""
         now = self._clock()
         if self._recent and now - self._recent[0][0] > 30.0:
             self._recent.popleft()
@@ -109,7 +109,7 @@ class ProgressLine:
 
 
 class EvaluationProgress:
-    """A :class:`ProgressLine` for each policy in turn that :func:`vusfa.evaluation.compare` evaluates.
+    """One :class:`ProgressLine` per policy that :func:`vusfa.evaluation.compare` evaluates.
 
     >>> with EvaluationProgress() as progress:
     ...     result = None  # compare(policies, scenes, "all", progress=progress)
@@ -122,7 +122,7 @@ class EvaluationProgress:
         self._line: ProgressLine | None = None
 
     def __call__(self, policy: str, done: int, total: int) -> None:
-        """Set how many of a policy's episodes are done."""
+        """Set the number of a policy's episodes done."""
         if policy != self._policy or self._line is None:
             self._close()
             self._policy = policy
@@ -152,7 +152,7 @@ def describe(
     *,
     unit: str = "frames",
 ) -> str:
-    """Text of the line; NaN: not known yet.
+    """Format the line; NaN: not known yet.
 
     >>> describe(250_000, 1_000_000, 5000.0, 0.975, 1.127)
     '250,000 of 1,000,000 frames | 5,000 per second | success 97.5 % | length / shortest 1.13 | 2:30 to go'

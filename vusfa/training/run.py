@@ -1,4 +1,4 @@
-"""A training from its first update to its last, or to what ends it before."""
+"""The loop of a training: updates, lines of the log, checkpoints, and an orderly end."""
 
 from __future__ import annotations
 

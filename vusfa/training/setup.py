@@ -1,4 +1,4 @@
-"""From settings to a trainer: what recipes, experiments and benchmarks share."""
+"""Construction of a trainer from settings, for recipes, experiments and benchmarks."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ __all__ = ["decide_autocast", "make_observation", "make_trainer", "row_name", "s
 def make_trainer(
     settings: Mapping[str, Any], overrides: Sequence[str] = (), scenes: SceneSet | None = None
 ) -> Trainer:
-    """A trainer, from the settings of ``vusfa train``.
+    """Make a trainer from the settings of ``vusfa train``.
 
     Args:
         settings: as in vusfa/conf/train.yaml, plain and resolved.
@@ -39,7 +39,7 @@ def make_trainer(
         scenes: the world; opened as the settings say when not given.
 
     Raises:
-        VusfaError: settings that make no sense, in words.
+        VusfaError: settings that are out of range or do not fit each other.
     """
     torch.manual_seed(settings["seed"])
     device, optim = usable_device(settings["device"]), settings["optim"]
@@ -93,7 +93,7 @@ def make_trainer(
 
 
 def decide_autocast(settings: Mapping[str, Any]) -> bool:
-    """Whether to compute in bfloat16; a resumed training goes on as it began unless told otherwise.
+    """Decide whether to compute in bfloat16; a resumed training keeps its precision by default.
 
     Args:
         settings: as in vusfa/conf/train.yaml, plain and resolved.
@@ -111,8 +111,8 @@ def decide_autocast(settings: Mapping[str, Any]) -> bool:
 
 
 def make_observation(agent: Agent, scenes: SceneSet, crop: str = "first") -> SceneObservation | None:
-    """The transform between the world and an agent that reads features or pixels; None for one that reads
-    ids.
+    """Make the transform that adds the observations of an agent that reads features or pixels; None for one
+    that reads ids.
 
     Args:
         agent: the agent.
@@ -155,7 +155,7 @@ def row_name(settings: Mapping[str, Any]) -> str:
 
 
 def set_threads(threads: int) -> None:
-    """Sets how many processor threads torch computes with in this process, and has it keep its memory
+    """Set the number of processor threads that torch uses in this process, and have it keep its memory
     (:func:`~vusfa.training.memory.keep_memory`).
 
     Raises:

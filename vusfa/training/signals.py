@@ -32,7 +32,7 @@ class StopOnSignal:
 
     @property
     def exit_code(self) -> int:
-        """What a shell reports of a process that the signal ended: 128 + its number; 0 without one."""
+        """Exit code as a shell reports it: 128 plus the signal's number; 0 without a signal."""
         return 128 + self.received if self.received is not None else 0
 
     def __enter__(self) -> StopOnSignal:

@@ -30,14 +30,19 @@ class TensorBoardLogger:
     Args:
         folder: the run's folder.
         config: shown under "text".
+        resume_frames: frames of the checkpoint that the run continues from; what the earlier files hold of
+            later frames, TensorBoard leaves out.
     """
 
     shows_media = True
 
-    def __init__(self, folder: str | Path, config: Mapping[str, Any]) -> None:
+    def __init__(
+        self, folder: str | Path, config: Mapping[str, Any], resume_frames: int | None = None
+    ) -> None:
         from torch.utils.tensorboard import SummaryWriter
 
-        self._writer: Any = SummaryWriter(str(folder))
+        later = None if resume_frames is None else resume_frames + 1
+        self._writer: Any = SummaryWriter(str(folder), purge_step=later)
         lines = [{"setting": key, "value": value} for key, value in flat(config).items()]
         self._writer.add_text("config", _markdown(lines))
 

@@ -46,7 +46,7 @@ __all__ = ["Trainer"]
 
 
 class Trainer:
-    """Everything that changes while an agent learns, and one update after the other.
+    """State of a training, and its updates.
 
     :func:`~vusfa.training.make_trainer` makes one from settings.
 
@@ -57,10 +57,10 @@ class Trainer:
         algorithm: its losses.
         optimizer: of ``algorithm.parameters()``.
         make_collector: called with the policy that collects.
-        settings: all settings, plain.
+        settings: all settings, as plain data.
         overrides: the command line that made them; kept in checkpoints.
         observation: transform between world and agent, or None.
-        note: what the algorithm's preparation has to say, or None.
+        note: message of the algorithm's preparation, or None.
 
     Attributes:
         actor: the policy; writes ``action``.
@@ -103,8 +103,8 @@ class Trainer:
 
     @contextmanager
     def collecting(self) -> Iterator[Iterator[TensorDictBase]]:
-        """Batches of a new collector, from where a resumed checkpoint stood; its processes end with the
-        context."""
+        """Context manager of a new collector's batches, which continue where a resumed checkpoint stopped;
+        its processes end with the context."""
         with opened(self._make_collector) as collector:
             self._collector = collector
             try:
@@ -133,7 +133,7 @@ class Trainer:
             return next(batches)
 
     def update(self, batches: Iterator[TensorDictBase]) -> tuple[TensorDictBase, dict[str, Tensor]]:
-        """One update, counted.
+        """Collect a batch and learn from it.
 
         Args:
             batches: those of :meth:`collecting`.
@@ -174,7 +174,7 @@ class Trainer:
         return batch, terms
 
     def metrics(self) -> dict[str, float]:
-        """A line of the log: what the meters hold, which begin anew, and how far the training has come.
+        """Metrics since the last call, for a line of the log; the meters start over.
 
         Raises:
             VusfaError: a weight is not finite.
@@ -185,7 +185,7 @@ class Trainer:
         return head | self.episodes.flush() | self.terms.flush()
 
     def save(self, path: str | Path) -> Path:
-        """Writes a checkpoint, atomically, within :meth:`collecting`; see :mod:`vusfa.training.checkpoint`.
+        """Write a checkpoint atomically, within :meth:`collecting`; see :mod:`vusfa.training.checkpoint`.
 
         Raises:
             VusfaError: a weight is not finite; an earlier checkpoint stays as it is.
@@ -222,7 +222,7 @@ class Trainer:
         )
 
     def load_weights(self, state: Mapping[str, Any], path: str | Path = "the checkpoint") -> None:
-        """Takes a checkpoint's weights and what belongs to them, such as a multiplier, and nothing else.
+        """Load a checkpoint's weights and what belongs to them, such as the multiplier; nothing else.
 
         Args:
             state: content of the checkpoint.
@@ -235,7 +235,7 @@ class Trainer:
         self.algorithm.warm_start(state["algorithm"])
 
     def resume(self, path: str | Path) -> list[str]:
-        """Continues from a checkpoint; to be called before :meth:`collecting`.
+        """Continue from a checkpoint; call it before :meth:`collecting`.
 
         With a single collector what follows is what would have followed, number for number. Coefficients and
         the optimizer's numbers are those of the settings now; what the training itself has moved is restored.

@@ -107,7 +107,7 @@ def _every_second(look: Callable[[int, FrameType | None], None]) -> Iterator[Non
 
 
 def watch(collector: BaseCollector, limit: float | None) -> None:
-    """Has a collector with workers look after them while it waits for a batch.
+    """Make a collector check its workers while it waits for a batch.
 
     Args:
         collector: begun; any other than one with workers stays as it is.
@@ -134,7 +134,7 @@ def supervised(collector: BaseCollector) -> Iterator[None]:
 
 
 class Silence:
-    """How long each worker has sent nothing.
+    """Time since each worker last sent something.
 
     Args:
         workers: their processes.
@@ -196,7 +196,7 @@ class _WatchedQueue:
 
 
 def _dead(workers: Sequence[Any]) -> str | None:
-    """Words on the first worker that has ended."""
+    """Message about the first worker that has ended."""
     for index, worker in enumerate(workers):
         with suppress(ValueError):  # TorchRL has closed those that it ended itself
             if worker.exitcode is not None:
@@ -205,7 +205,7 @@ def _dead(workers: Sequence[Any]) -> str | None:
 
 
 def end_of(pid: int | None, code: int, index: int | None = None) -> str:
-    """How a worker process has ended, in words."""
+    """Describe how a worker process has ended."""
     name = "a worker of the collector" if index is None else f"worker {index} of the collector"
     if code < 0:
         try:
