@@ -11,6 +11,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
+import torch
 from tensordict import TensorDictBase
 from torch import Tensor, nn
 
@@ -71,6 +72,10 @@ class Algorithm:
         """Parts of a batch (num_envs, T), one optimizer step each: all of it, or with ``optim=a3c`` groups of
         as many environments as a step stands for."""
         return (batch,) if self.threads is None else batch.split(self.threads)
+
+    def scenes_on_record(self) -> Tensor:
+        """Scenes (n,) that an update may learn in besides those of its batch."""
+        return torch.empty(0, dtype=torch.int64)
 
     def losses(self, batch: TensorDictBase) -> Mapping[str, Tensor]:
         """Terms of a collector's batch (num_envs, T); scalars."""

@@ -70,6 +70,10 @@ class Hindsight(USF):
             raise ConfigError(f"hindsight: {error}") from error
         self.hindsight_loss.to(next(agent.parameters()).device)
 
+    def scenes_on_record(self) -> Tensor:
+        """Those of the replay buffer."""
+        return self.replay.scenes()
+
     def losses(self, batch: TensorDictBase) -> dict[str, Tensor]:
         """On-policy terms, and those of a sample that may hold the batch."""
         terms = super().losses(batch)

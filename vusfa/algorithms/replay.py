@@ -198,6 +198,12 @@ class HindsightReplay:
             self.sampler.see(ids[..., -1], rows.get("scene_id"))
         self.buffer.extend(rows)
 
+    def scenes(self) -> Tensor:
+        """Scenes (n,) of the transitions on record, ascending."""
+        if not len(self):
+            return torch.empty(0, dtype=torch.int64)
+        return self.buffer[:].get("scene_id").bincount().nonzero()[:, 0].cpu()
+
     def sample(self) -> TensorDictBase:
         """Transitions with ``goal_id`` and ``steps_to_goal``, (batch_size,)."""
         return self.buffer.sample().exclude("index", "clock")

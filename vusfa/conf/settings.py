@@ -49,7 +49,8 @@ POSITIVE = (
 
 @dataclass
 class EnvSettings:
-    """Settings of :class:`vusfa.envs.TargetNavEnv`; goals and crop may be of several types."""
+    """Settings of :class:`vusfa.envs.TargetNavEnv`; goals and crop may be of several types. The last
+    three are of :class:`vusfa.envs.SceneRotation`; ``active_scenes`` null: all, all the time."""
 
     goals: Any
     goal_sampling: str
@@ -58,6 +59,9 @@ class EnvSettings:
     step_reward: float
     collision_reward: float | None
     max_steps: int = MAX_STEPS
+    active_scenes: int | None = None
+    scene_stay: int = 100_000
+    scene_weights: dict[str, float] = field(default_factory=dict)
 
 
 @dataclass

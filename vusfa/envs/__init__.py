@@ -10,7 +10,8 @@ from vusfa.envs import gym
 from vusfa.envs.goals import resolve_goals, spread_goals
 from vusfa.envs.navigation import TargetNavEnv
 from vusfa.envs.observation import SceneObservation
+from vusfa.envs.rotation import SceneRotation
 
-__all__ = ["SceneObservation", "TargetNavEnv", "resolve_goals", "spread_goals"]
+__all__ = ["SceneObservation", "SceneRotation", "TargetNavEnv", "resolve_goals", "spread_goals"]
 
 gym.register()

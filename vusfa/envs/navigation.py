@@ -15,9 +15,10 @@ from torch import Tensor
 
 from vusfa.envs import dynamics
 from vusfa.envs.goals import GoalSpec, resolve_goals
-from vusfa.envs.scene_env import SceneEnv, usable_device
+from vusfa.envs.rotation import Rotation, SceneRotation
+from vusfa.envs.scene_env import SceneEnv, check_least, usable_device
 from vusfa.envs.starts import DRAW_LIMIT, GoalTable, draw_goals, draw_starts, paths_from
-from vusfa.envs.world import make_world
+from vusfa.envs.world import RotatingWorld, make_world
 from vusfa.errors import ConfigError, GoalError
 from vusfa.scenes import SceneSet
 from vusfa.torchrl_private import unchecked_tensordict
@@ -46,6 +47,10 @@ class TargetNavEnv(SceneEnv):
         device: where the tables and the data are; the CPU by default.
         shortest_path: also write the key of that name. It is privileged (no agent could know it), so no
             policy is given it by default; the trainer's metrics ask for it.
+        rotation: episodes begin in a few active scenes, which change; None for all scenes all the time. With
+            fixed goals, a row keeps its goal for as long as the goal's scene is active.
+        first_frame, frames_per_step: where the rotation stands before the first step, and by how many frames
+            a step takes it on, for environments that share the work with others; their own rows by default.
 
     Keys of the data, at the root and under "next" (reward only there):
 
@@ -107,19 +112,25 @@ class TargetNavEnv(SceneEnv):
         seed: int | None = None,
         device: torch.device | str | None = None,
         shortest_path: bool = False,
+        rotation: SceneRotation | None = None,
+        first_frame: int = 0,
+        frames_per_step: int | None = None,
     ) -> None:
-        _check_arguments(
-            history=history, max_steps=max_steps, goal_sampling=goal_sampling, first_goal=first_goal
-        )
+        check_least(history=(history, 1), max_steps=(max_steps, 1), first_goal=(first_goal, 0))
+        if goal_sampling not in ("fixed", "episode"):
+            raise ConfigError(f"goal_sampling is {goal_sampling!r}; it is 'fixed' or 'episode'")
         super().__init__(scenes, batch_size, history, seed)
         self.max_steps = max_steps
         self.goal_sampling = goal_sampling
         self.goals = resolve_goals(self.scenes, goals)
         rewards = dynamics.Rewards.of(goal_reward, step_reward, collision_reward)
-        rows = None
-        if goal_sampling == "fixed":
-            rows = (torch.arange(self.numel()) + first_goal).reshape(self.batch_size)
-        self._world = make_world(self.scenes, self.goals, rewards, rows)
+        numbers = (torch.arange(self.numel()) + first_goal).reshape(self.batch_size)
+        rows = numbers if goal_sampling == "fixed" else None
+        if rotation is not None:
+            turns, step = Rotation(rotation, self.scenes, self.goals), frames_per_step or self.numel()
+            if turns.rotates:
+                self._rotating = RotatingWorld(self.scenes, turns, rewards, rows, first_frame, step)
+        self._world = self._turned() or make_world(self.scenes, self.goals, rewards, rows)
         self._make_specs(shortest_path)
         if device is not None:
             self.to(usable_device(device))
@@ -133,6 +144,7 @@ class TargetNavEnv(SceneEnv):
         )
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        self._rotate()
         world = self._world
         state, action = (
             {key: tensordict.get(key, None) for key in keys} for keys in (self._keys, ["action"])
@@ -286,15 +298,3 @@ class TargetNavEnv(SceneEnv):
             fresh = self._fresh()
             entries = {key: dynamics.rows_where(over, fresh[key], value) for key, value in entries.items()}
         return entries
-
-
-def _check_arguments(*, history: int, max_steps: int, goal_sampling: str, first_goal: int) -> None:
-    for name, value, least in (
-        ("history", history, 1),
-        ("max_steps", max_steps, 1),
-        ("first_goal", first_goal, 0),
-    ):
-        if value < least:
-            raise ConfigError(f"{name} is {value}; it must be at least {least}")
-    if goal_sampling not in ("fixed", "episode"):
-        raise ConfigError(f"goal_sampling is {goal_sampling!r}; it is 'fixed' or 'episode'")

@@ -12,13 +12,26 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from vusfa.envs.rendering import draw_panels
-from vusfa.envs.world import World, env_specs, map_tensors
+from vusfa.envs.world import RotatingWorld, World, env_specs, map_tensors
 from vusfa.errors import ConfigError
 from vusfa.limits import brief
 from vusfa.scenes import SceneSet
 from vusfa.torchrl_private import StatelessEnv
 
-__all__ = ["SceneEnv", "usable_device"]
+__all__ = ["SceneEnv", "check_least", "usable_device"]
+
+
+def check_least(**arguments: tuple[int, int]) -> None:
+    """Refuse arguments, each with its smallest value, that are smaller.
+
+    >>> check_least(history=(0, 1))
+    Traceback (most recent call last):
+    ...
+    vusfa.errors.ConfigError: history is 0; it must be at least 1
+    """
+    for name, (value, least) in arguments.items():
+        if value < least:
+            raise ConfigError(f"{name} is {value}; it must be at least {least}")
 
 
 def usable_device(device: torch.device | str) -> torch.device:
@@ -53,6 +66,8 @@ class SceneEnv(StatelessEnv):
     batch_locked: ClassVar[bool] = True
     metadata: ClassVar[dict[str, Any]] = {"render_modes": ["rgb_array"], "render_fps": 4}
     _world: World
+    _rotating: RotatingWorld | None = None
+    goals: Tensor
 
     def __init_subclass__(cls, **options: Any) -> None:
         """Let :func:`inspect.signature` find the arguments, which TorchRL's metaclass hides."""
@@ -133,6 +148,26 @@ class SceneEnv(StatelessEnv):
             self._generator = torch.Generator(device)
             self._set_seed(self._seed)
         return self
+
+    def _turned(self) -> World | None:
+        """The world's tables where the rotation has changed them."""
+        world = None if self._rotating is None else self._rotating.world()
+        return None if world is None else map_tensors(lambda table: table.to(self.device), world)
+
+    def _rotate(self) -> None:
+        """Take the rotation on by one step."""
+        if self._rotating is not None:
+            self._rotating.frames += self._rotating.frames_per_step
+            self._world = self._turned() or self._world
+
+    def coming_goals(self, steps: int) -> Tensor:
+        """Goals (G,) of the episodes that can begin within so many steps, global ids."""
+        rotating = self._rotating
+        if rotating is None:
+            return self.goals
+        return rotating.rotation.goals_between(
+            rotating.frames, rotating.frames + steps * rotating.frames_per_step
+        )
 
     def _show(self, state_id: Tensor, goal_id: Tensor, mask: Tensor | None = None) -> None:
         """Remember what :meth:`render` shows by default."""

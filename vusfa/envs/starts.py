@@ -20,6 +20,7 @@ from vusfa.scenes.graph import steps_to_goals, strong_components
 __all__ = [
     "DRAW_LIMIT",
     "GoalTable",
+    "StartCache",
     "StartTable",
     "draw_goals",
     "draw_starts",
@@ -76,7 +77,18 @@ class StartTable(NamedTuple):
     scene_goals: Tensor
 
 
-def start_table(graphs: Sequence[Tensor], offsets: Tensor, goals: Tensor, names: Sequence[str]) -> StartTable:
+class StartCache(dict[int, tuple[Tensor, dict[int, Tensor]]]):
+    """Of scenes, by their index: the component of each state (N,), and of each component that has a goal the
+    states that reach it."""
+
+
+def start_table(
+    graphs: Sequence[Tensor],
+    offsets: Tensor,
+    goals: Tensor,
+    names: Sequence[str],
+    known: StartCache | None = None,
+) -> StartTable:
     """Find the starts of every goal.
 
     Args:
@@ -84,6 +96,7 @@ def start_table(graphs: Sequence[Tensor], offsets: Tensor, goals: Tensor, names:
         offsets: (n_scenes + 1,) int64, the global id of each scene's first state.
         goals: (G,) int64 global ids, G at least 1; repeats are allowed.
         names: of the scenes, for the message.
+        known: what was found before about the same graphs; added to.
 
     Raises:
         GoalError: no other state can reach a goal.
@@ -96,16 +109,21 @@ def start_table(graphs: Sequence[Tensor], offsets: Tensor, goals: Tensor, names:
     scene = torch.bucketize(goals, offsets, right=True) - 1
     first, starts, rank = (torch.zeros_like(goals) for _ in range(3))
     lists: list[Tensor] = []
-    length = 0
+    length, known = 0, StartCache() if known is None else known
     for index in scene.unique().tolist():
         of_scene = (scene == index).nonzero()[:, 0]
         offset = int(offsets[index])
         local = goals[of_scene] - offset
-        component = _component_of_state(graphs[index])
+        if index not in known:
+            known[index] = _component_of_state(graphs[index]), {}
+        component, reached_by = known[index]
         for label in component[local].unique().tolist():
             slot = of_scene[component[local] == label]
             target = goals[slot] - offset
-            reaching = (steps_to_goals(graphs[index], int(target[0]))[0] >= 0).nonzero()[:, 0]
+            if label not in reached_by:
+                to_goal = steps_to_goals(graphs[index], int(target[0]))[0]
+                reached_by[label] = (to_goal >= 0).nonzero()[:, 0]
+            reaching = reached_by[label]
             if len(reaching) == 1:
                 raise GoalError(
                     f"scene {names[index]!r}: no other state can reach goal {int(target[0])}"

@@ -10,10 +10,11 @@ from torch import Tensor
 from torchrl.data import Bounded, Categorical, Composite, TensorSpec, Unbounded
 
 from vusfa.envs.dynamics import Rewards
-from vusfa.envs.starts import GoalTable, StartTable, path_table, start_table
+from vusfa.envs.rotation import Rotation
+from vusfa.envs.starts import GoalTable, StartCache, StartTable, path_table, start_table
 from vusfa.scenes import SceneSet
 
-__all__ = ["STATE", "Observed", "Specs", "World", "env_specs", "make_world", "map_tensors"]
+__all__ = ["STATE", "Observed", "RotatingWorld", "Specs", "World", "env_specs", "make_world", "map_tensors"]
 
 #: Keys that the environment reads back; the last where it was asked for.
 STATE = ("state_id", "goal_id", "scene_id", "elapsed_steps", "shortest_path")
@@ -39,7 +40,44 @@ class World(NamedTuple):
     paths: Tensor | None
 
 
-def make_world(scenes: SceneSet, goals: Tensor, rewards: Rewards, rows: Tensor | None) -> World:
+class RotatingWorld:
+    """Tables of the active scenes of a rotation, made anew at each of its turns.
+
+    Args:
+        scenes: the world.
+        rotation: of its scenes.
+        rewards: what a step earns.
+        rows: (*B,) int64, numbers of the rows; None when goals are drawn.
+        first_frame: frames of all environments before the first step.
+        frames_per_step: environments of all processes together.
+    """
+
+    def __init__(
+        self,
+        scenes: SceneSet,
+        rotation: Rotation,
+        rewards: Rewards,
+        rows: Tensor | None,
+        first_frame: int,
+        frames_per_step: int,
+    ) -> None:
+        self.scenes, self.rotation, self.rewards, self.rows = scenes, rotation, rewards, rows
+        self.frames, self.frames_per_step = first_frame, frames_per_step
+        self.turn, self._starts = -1, StartCache()
+
+    def world(self) -> World | None:
+        """The tables on the CPU where they have changed, else None."""
+        turn = self.rotation.turn(self.frames)
+        if turn == self.turn:
+            return None
+        self.turn = turn
+        rows = None if self.rows is None else self.rotation.rows_at(turn, self.rows)
+        return make_world(self.scenes, self.rotation.goals_at(turn)[0], self.rewards, rows, self._starts)
+
+
+def make_world(
+    scenes: SceneSet, goals: Tensor, rewards: Rewards, rows: Tensor | None, known: StartCache | None = None
+) -> World:
     """Gather the tables.
 
     Args:
@@ -47,13 +85,13 @@ def make_world(scenes: SceneSet, goals: Tensor, rewards: Rewards, rows: Tensor |
         goals: (G,) int64 global ids; a GoalError where no other state can reach one.
         rewards: what a step earns.
         rows: (*B,) int64, position of each row's goal in ``goals``, modulo G; None when goals are drawn.
+        known: starts that were found before, see :func:`~vusfa.envs.starts.start_table`.
 
     >>> world = make_world(SceneSet.bundled("bathroom"), torch.tensor([3, 9]), Rewards.of(), torch.arange(3))
     >>> world.rows.goal
     tensor([3, 9, 3])
     """
-    graphs = [scene.graph for scene in scenes.scenes]
-    starts = start_table(graphs, scenes.offsets, goals, scenes.names)
+    starts = start_table([scene.graph for scene in scenes.scenes], scenes.offsets, goals, scenes.names, known)
     return World(
         successor=scenes.successor,
         blocked=scenes.blocked,

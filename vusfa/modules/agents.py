@@ -15,7 +15,7 @@ from tensordict.nn import (
     TensorDictSequential,
 )
 from tensordict.nn import TensorDictModule as Step
-from torch import nn
+from torch import Tensor, nn
 from torch.distributions import Categorical
 from torchrl.data import Unbounded
 from torchrl.envs.transforms import InitTracker, TensorDictPrimer, Transform
@@ -94,7 +94,12 @@ class Agent(nn.Module):
 
     Attributes:
         config: plain dict, from which ``make_agent`` rebuilds the agent in the same scenes.
+        num_scenes: scenes that the heads hold weights of; 1 with shared heads.
+        scene_slots: (n,) int64, where those of each scene are; None in order. See
+            :class:`~vusfa.modules.SceneLinear`.
     """
+
+    scene_slots: Tensor | None = None
 
     def __init__(self, config: AgentConfig, scenes: Any) -> None:
         super().__init__()

@@ -25,6 +25,7 @@ from vusfa.errors import ConfigError
 from vusfa.modules.draws import action_probs, draw, draw_actions
 from vusfa.modules.precision import autocast_copy
 from vusfa.modules.rows import RowScenes, SceneBlocks, SortedByScene
+from vusfa.modules.tables import states_around, table_pays
 from vusfa.modules.trunk import CachedTrunk, SiameseTrunk, remember
 from vusfa.modules.unique import shapes_may_vary
 from vusfa.scenes import SceneSet
@@ -33,9 +34,6 @@ if TYPE_CHECKING:
     from vusfa.modules.agents import Agent
 
 __all__ = ["InferencePolicy", "TabularPolicy"]
-
-#: A table is made where it has at most this many pairs of state and goal per row that will be asked for.
-PAIRS_PER_ROW = 3
 
 
 class _Layers(NamedTuple):
@@ -85,7 +83,11 @@ class InferencePolicy(TensorDictModuleBase):
 
     @contextmanager
     def cached(
-        self, goals: Tensor | None = None, scenes: SceneSet | None = None, rows: int | None = None
+        self,
+        goals: Tensor | None = None,
+        scenes: SceneSet | None = None,
+        rows: int | None = None,
+        states: Tensor | None = None,
     ) -> Iterator[None]:
         """Context in which the weights are constant and what calls share is computed once, without gradients.
 
@@ -94,24 +96,28 @@ class InferencePolicy(TensorDictModuleBase):
             scenes: the agent's world. An agent that sees one frame is then tabulated, where the table has at
                 most three times as many entries as ``rows``.
             rows: expected number of rows; None for many.
+            states: (n,) ids of the only states to come, ascending; where ``scenes`` are given, those of the
+                goals' scenes.
         """
         before = self._layers, self._table
         try:
-            if scenes is not None and self.agent.is_tabular and _table_pays(scenes, goals, rows):
+            if scenes is not None and self.agent.is_tabular and table_pays(scenes, goals, rows):
                 self._table = [TabularPolicy(self.agent, scenes, goals)]
             else:
-                self._layers = self._cached_layers(goals, rows)
+                if scenes is not None and goals is not None:
+                    states = states_around(scenes, goals)
+                self._layers = self._cached_layers(goals, rows, states)
             yield
         finally:
             self._layers, self._table = before
 
-    def _cached_layers(self, goals: Tensor | None, rows: int | None) -> _Layers:
+    def _cached_layers(self, goals: Tensor | None, rows: int | None, states: Tensor | None) -> _Layers:
         trunk, *heads = self._modules_run()
         memory = [] if self.agent.memory is None else [heads.pop(0)]
         if self._whole or not trunk.encoder.by_id or self._computes_frames(rows):
             trunk, *heads = autocast_copy([trunk, *heads])
             return _Layers(trunk if self._whole else trunk.fused, [*memory, *heads])
-        return _Layers(CachedTrunk(trunk, goals, rows).fused, [*memory, *autocast_copy(heads)])
+        return _Layers(CachedTrunk(trunk, goals, rows, states).fused, [*memory, *autocast_copy(heads)])
 
     def _computes_frames(self, rows: int | None) -> bool:
         """Whether frames are learned, and so few are asked for that not all should be computed."""
@@ -182,6 +188,8 @@ class InferencePolicy(TensorDictModuleBase):
         # on an accelerator counting means waiting for it
         if self.agent.num_scenes == 1 or scene.is_cuda or not shapes_may_vary(scene):
             return self.logits(state, goal, scene)
+        if self.agent.scene_slots is not None:
+            scene = self.agent.scene_slots[scene]
         rows, order = SortedByScene.sort(scene, self.agent.num_scenes)
         blocks = SceneBlocks.of(rows, order)
         if blocks is not None:
@@ -239,18 +247,19 @@ class TabularPolicy(TensorDictModuleBase):
         which = torch.repeat_interleave(torch.arange(len(goals), device=goals.device), size)
         self.goal, self.scene = goals[which], scene[which]
         self.state = torch.arange(len(which), device=goals.device) - (first - offset)[which]
-        self._logits = self._ask(agent, goals, at_once)
+        self._logits = self._ask(agent, goals, states_around(scenes, goals), at_once)
         self._probs: Tensor | None = None
 
     @torch.no_grad()
-    def _ask(self, agent: Agent, goals: Tensor, at_once: int) -> Tensor:
+    def _ask(self, agent: Agent, goals: Tensor, states: Tensor | None, at_once: int) -> Tensor:
         policy, parts = InferencePolicy(agent), []
         columns = (part.split(at_once) for part in (self.state, self.goal, self.scene))
-        with policy.cached(goals):
+        with policy.cached(goals, states=states):
             for state, goal, scene in zip(*columns, strict=True):
                 rows: RowScenes = scene
                 if agent.num_scenes > 1 and not scene.is_cuda:  # there counting means waiting for the device
-                    rows = SortedByScene.of(scene, agent.num_scenes)
+                    slot = scene if agent.scene_slots is None else agent.scene_slots[scene]
+                    rows = SortedByScene.of(slot, agent.num_scenes)
                 parts.append(policy.logits(state.unsqueeze(-1), goal, rows))
         return torch.cat(parts)
 
@@ -275,14 +284,6 @@ class TabularPolicy(TensorDictModuleBase):
                 self._probs = action_probs(self._logits)
             return tensordict.set("action", draw(self._probs[rows]))
         return tensordict.set("action", draw_actions(self._logits[rows], interaction))
-
-
-def _table_pays(scenes: SceneSet, goals: Tensor | None, rows: int | None) -> bool:
-    """Whether a table costs less than its look-ups save; a pair costs little in a large product."""
-    if rows is None:
-        return True
-    scene = scenes.scene_id if goals is None else scenes.scene_id[goals.to(scenes.device).unique()]
-    return int(scenes.offsets.diff()[scene].sum()) <= PAIRS_PER_ROW * rows
 
 
 def _tuple(written: Any) -> tuple[Any, ...]:

@@ -35,6 +35,8 @@ class SceneLinear(nn.Module):
     Attributes:
         weight: (num_scenes, out_features, in_features).
         bias: (num_scenes, out_features).
+        slots: (n,) int64, where the weights of each of n scenes are, while the layer holds those of some
+            (:class:`vusfa.training.active_heads.ActiveHeads`); None while it holds all, in order.
 
     >>> layer = SceneLinear(3, 8, 5)
     >>> x, scene_id = torch.randn(4, 8), torch.tensor([2, 0, 2, 1])
@@ -50,6 +52,7 @@ class SceneLinear(nn.Module):
         self.num_scenes = num_scenes
         self.in_features = in_features
         self.out_features = out_features
+        self.slots: Tensor | None = None
         self.weight = nn.Parameter(torch.empty(num_scenes, out_features, in_features))
         self.bias = nn.Parameter(torch.empty(num_scenes, out_features))
         self.reset_parameters()
@@ -73,6 +76,8 @@ class SceneLinear(nn.Module):
             parts = self._products(x, scene_id.counts, weight.unbind(0), bias.unbind(0))
             return parts[0] if len(parts) == 1 else torch.cat(parts)
         rows, scene = x.reshape(-1, self.in_features), scene_id.reshape(-1)
+        if self.slots is not None:
+            scene = self.slots[scene]
         if (
             self.num_scenes * self.out_features <= _DENSE_OUTPUTS
             or (rows.is_cuda and self.num_scenes <= _DENSE_SCENES)

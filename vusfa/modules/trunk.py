@@ -97,8 +97,9 @@ class CachedTrunk:
     Args:
         trunk: reads ids; its weights are read now.
         goals: (G,) ids of the only states that will be goals; None for all of the world.
-        rows: number of rows that will be asked for; None for many. With fewer rows than half of the world's
+        rows: number of rows that will be asked for; None for many. With fewer rows than half of the
             states, a frame is computed when it is first asked for, else all frames now.
+        states: (n,) ids of the only states that will be asked for; None for all of the world.
 
     >>> from vusfa.modules.frames import FeatureFrames
     >>> trunk = SiameseTrunk(SiameseEncoder(FeatureFrames(torch.rand(12, 1, 8)), 4, 16, 6), Fusion(6, 32))
@@ -110,9 +111,16 @@ class CachedTrunk:
     """
 
     @torch.no_grad()
-    def __init__(self, trunk: SiameseTrunk, goals: Tensor | None = None, rows: int | None = None) -> None:
+    def __init__(
+        self,
+        trunk: SiameseTrunk,
+        goals: Tensor | None = None,
+        rows: int | None = None,
+        states: Tensor | None = None,
+    ) -> None:
         encoder, fusion = trunk.encoder, trunk.fusion
-        features, first = encoder.frames.lookup(None), encoder.branch.first
+        features, first = encoder.frames.lookup(states), encoder.branch.first
+        self.place = None if states is None else _inverse(states, encoder.frames.num_states)
         (self.trunk,) = autocast_copy([trunk])
         self.known: Tensor | None = None  # (S, H) bool, the entries of ``frames`` that are computed
         # one frame: (S, 1, hidden), per state; more: (S, H, hidden), per frame and place
@@ -129,10 +137,8 @@ class CachedTrunk:
             self.frames = first.project(features)
         self.row: Tensor | None = None
         if goals is not None:
-            # -1 where a state is no goal: looking it up fails
-            self.row = torch.full((len(features),), -1, dtype=torch.int64, device=features.device)
-            self.row[goals] = torch.arange(len(goals), device=features.device)
-            features = features[goals]
+            self.row = _inverse(goals.to(features.device), encoder.frames.num_states)
+            features = encoder.frames.lookup(goals)
         goal_first = (encoder.goal_branch or encoder.branch).first.repeated(features)
         self.goals = fusion.goal_part(encoder.embed_goal(goal_first))  # (G, hidden)
 
@@ -141,6 +147,8 @@ class CachedTrunk:
         """(R, hidden) of ids (R, H) and (R,)."""
         encoder, fusion = self.trunk.encoder, self.trunk.fusion
         state = state[:, -encoder.history :]
+        if self.place is not None:
+            state = self.place[state]
         if self.known is not None:
             self._compute(state, self.known)
         goal_part = gather(self.goals, goal if self.row is None else self.row[goal])
@@ -166,6 +174,13 @@ class CachedTrunk:
                 part = fusion.state_part(encoder.embed_state(part))
             self.frames[new, place] = part
             known[new, place] = True
+
+
+def _inverse(ids: Tensor, number: int) -> Tensor:
+    """Place (number,) of every id among ``ids``; -1, with which every look-up fails, for the others."""
+    place = torch.full((number,), -1, dtype=torch.int64, device=ids.device)
+    place[ids] = torch.arange(len(ids), device=ids.device)
+    return place
 
 
 class SceneLayer(nn.Module):

@@ -21,6 +21,7 @@ from typing import Any
 
 import torch
 from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
 from torchrl.collectors import BaseCollector, Collector, MultiAsyncCollector, MultiSyncCollector
 from torchrl.envs import EnvBase, TransformedEnv
 from torchrl.envs.transforms import Compose, Transform
@@ -38,6 +39,7 @@ __all__ = [
     "check_goals_dealt",
     "close_collector",
     "collector_state",
+    "coming_goals",
     "load_collector_state",
     "make_collector",
     "make_env",
@@ -203,6 +205,15 @@ def close_collector(collector: BaseCollector) -> None:
     """End a collector's processes."""
     collector.shutdown()
     end_weight_sharing(collector)  # an exception's traceback is enough to keep it alive
+
+
+def coming_goals(collector: Collector) -> Tensor:
+    """Goals (G,) that a collector's next batch can have: of episodes that go on, and of those to come."""
+    env = _base(collector.env)
+    goals = env.coming_goals(collector.requested_frames_per_batch // env.numel())
+    if env.goals is goals:
+        return goals
+    return torch.cat([goals, carrier(collector).get("goal_id").cpu().flatten()]).unique()
 
 
 def collector_state(collector: BaseCollector) -> dict[str, Any]:

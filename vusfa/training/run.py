@@ -81,10 +81,13 @@ def _run(
         progress.update(trainer.frames)
         ended = trainer.frames >= total  # a short training is logged, too
         if converged is not None and not ended and before // every < trainer.frames // every:
-            ended = converged()
+            with trainer.whole():
+                ended = converged()
         is_best = False
         if ended or before // log_every < trainer.frames // log_every:
-            metrics = trainer.metrics() | ({} if validate is None else dict(validate(ended)))
+            with trainer.whole():
+                validated = {} if validate is None else dict(validate(ended))
+            metrics = trainer.metrics() | validated
             loggers.log_metrics(metrics, trainer.frames)
             progress.rates(metrics, validated=validate is not None)
             is_best = metrics.get(SCORE, math.nan) > trainer.validation["best"]

@@ -11,11 +11,13 @@ from tensordict.nn import TensorDictModuleBase
 from torchrl.collectors import BaseCollector
 
 from vusfa.algorithms import make_algorithm, threads_per_step
-from vusfa.envs import SceneObservation, resolve_goals
+from vusfa.envs import SceneObservation, SceneRotation, resolve_goals
+from vusfa.envs.rotation import Rotation
 from vusfa.envs.scene_env import usable_device
 from vusfa.errors import ConfigError
 from vusfa.modules import Agent, make_agent
 from vusfa.scenes import SceneSet
+from vusfa.training.active_heads import ActiveHeads
 from vusfa.training.checkpoint import load_checkpoint
 from vusfa.training.collectors import check_goals_dealt, make_collector, make_env, rows_per_worker
 from vusfa.training.hogwild import HogwildTrainer
@@ -47,7 +49,11 @@ def make_trainer(
         settings = {**settings, "autocast": decide_autocast(settings)}
     scenes = SceneSet.open(settings["scenes"]) if scenes is None else scenes
     goals = resolve_goals(scenes, settings["env"]["goals"])
-    check_goals_dealt(len(goals), settings["collector"]["num_envs"], settings["env"]["goal_sampling"])
+    task = {**settings["env"], "goals": goals}
+    rotation = make_rotation(task, settings["seed"])
+    turns = None if rotation is None else Rotation(rotation, scenes, goals)
+    num_goals = len(goals) if turns is None else turns.rows_needed
+    check_goals_dealt(num_goals, settings["collector"]["num_envs"], task["goal_sampling"])
     counts = ("kind", "num_envs", "num_workers", "rollout")
     rows_per_worker(**{name: settings["collector"][name] for name in counts})  # refused before any work
     chosen = {key: value for key, value in settings["agent"].items() if value is not None}
@@ -62,14 +68,17 @@ def make_trainer(
         **optim["options"],
     )
     note = None if settings["resume"] else algorithm.prepare()
-    task = {**settings["env"], "goals": goals}
     observation = make_observation(agent, scenes, task.pop("crop"))
     transforms = [*([observation] if observation is not None else []), *agent.make_env_transforms()]
     env = partial(make_env, scenes, transforms, history=agent.config["history"], device=device, **task)
+    if rotation is not None:
+        env = partial(env, rotation=rotation, frames_per_step=settings["collector"]["num_envs"])
 
     def collector(policy: TensorDictModuleBase) -> BaseCollector:
+        # of a resumed training the frames are known by now
+        turned = {} if rotation is None else {"first_frame": trainer.frames}
         return make_collector(
-            make_env=env,
+            make_env=partial(env, **turned),
             policy=policy,
             seed=settings["seed"],
             autocast=settings["autocast"],
@@ -87,9 +96,29 @@ def make_trainer(
         "observation": observation,
         "note": note,
     }
+    if turns is not None and turns.rotates and agent.num_scenes > 1:
+        if settings["collector"]["kind"] == "hogwild":
+            raise ConfigError(
+                "collector=hogwild shares the heads of all scenes among its workers, which env.active_scenes"
+                " would lend; give agent.shared_heads=true, or another collector"
+            )
+        if settings["collector"]["kind"] == "single":
+            parts["heads"] = ActiveHeads(agent, optimizer)
     if settings["collector"]["kind"] == "hogwild":
         return HogwildTrainer(make_env=env, **parts)
-    return Trainer(make_collector=collector, **parts)
+    trainer = Trainer(make_collector=collector, **parts)
+    return trainer
+
+
+def make_rotation(task: dict[str, Any], seed: int) -> SceneRotation | None:
+    """Take the settings of a rotation of scenes out of those of ``env``; None where all are active.
+
+    >>> make_rotation({"active_scenes": 4, "scene_stay": 1000}, seed=0)
+    SceneRotation(active=4, stay=1000, seed=0, weights={})
+    """
+    chosen = {"active_scenes": "active", "scene_stay": "stay", "scene_weights": "weights"}
+    given = {argument: task.pop(name) for name, argument in chosen.items() if name in task}
+    return SceneRotation(seed=seed, **given) if given.get("active") is not None else None
 
 
 def decide_autocast(settings: Mapping[str, Any]) -> bool:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import secrets
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, ExitStack, contextmanager
+from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -25,6 +25,7 @@ from vusfa.envs import SceneObservation
 from vusfa.errors import VusfaError
 from vusfa.modules import Agent, InferencePolicy
 from vusfa.scenes import SceneSet
+from vusfa.training.active_heads import ActiveHeads
 from vusfa.training.checkpoint import (
     check_fits,
     differences,
@@ -33,7 +34,7 @@ from vusfa.training.checkpoint import (
     load_weights,
     save_checkpoint,
 )
-from vusfa.training.collectors import collector_state, load_collector_state, opened
+from vusfa.training.collectors import collector_state, coming_goals, load_collector_state, opened
 from vusfa.training.content import NO_VALIDATION, check_like, restore
 from vusfa.training.metrics import EpisodeMeter, MeanMeter
 from vusfa.training.optimization import descend, total_loss
@@ -61,6 +62,7 @@ class Trainer:
         overrides: the command line that made them; kept in checkpoints.
         observation: transform between world and agent, or None.
         note: message of the algorithm's preparation, or None.
+        heads: of active scenes, where only these are computed; for a single collector.
 
     Attributes:
         actor: the policy; writes ``action``.
@@ -86,11 +88,12 @@ class Trainer:
         overrides: Sequence[str] = (),
         observation: SceneObservation | None = None,
         note: str | None = None,
+        heads: ActiveHeads | None = None,
     ) -> None:
         self.scenes, self.goals, self.agent = scenes, goals, agent
         self.algorithm, self.optimizer = algorithm, optimizer
         self.settings, self.overrides = settings, overrides
-        self.observation, self.note = observation, note
+        self.observation, self.note, self.heads = observation, note, heads
         self.actor = agent.get_policy_operator(out_keys=["action"])
         self.acting = InferencePolicy(agent)
         self._make_collector = partial(make_collector, self.acting)
@@ -116,6 +119,12 @@ class Trainer:
                 yield iter(collector)
             finally:
                 self._collector = None
+                if self.heads is not None:
+                    self.heads.gather()
+
+    def whole(self) -> AbstractContextManager[None]:
+        """Context in which the agent has the heads of all scenes, for an evaluation in mid-training."""
+        return nullcontext() if self.heads is None else self.heads.whole()
 
     def collect(self, batches: Iterator[TensorDictBase]) -> TensorDictBase:
         """The collector's next batch, without an update.
@@ -126,8 +135,11 @@ class Trainer:
         collector = self._collector
         with self._precision(), ExitStack() as stack:
             if isinstance(collector, Collector):
-                frames = collector.requested_frames_per_batch
-                stack.enter_context(self.acting.cached(self.goals, self.scenes, frames))
+                frames, goals = collector.requested_frames_per_batch, coming_goals(collector)
+                if self.heads is not None:
+                    self._entered = self.scenes.scene_id.cpu()[goals].unique()
+                    self.heads.load(self._entered)
+                stack.enter_context(self.acting.cached(goals, self.scenes, frames))
             if collector is not None:
                 stack.enter_context(supervised(collector))
             return next(batches)
@@ -150,6 +162,9 @@ class Trainer:
         )
         self.algorithm.schedule(self.frames)
         batch = self.collect(batches)
+        if self.heads is not None:
+            scenes = torch.cat([self._entered, self.algorithm.scenes_on_record()]).unique()
+            self.heads.load(scenes, exactly=True)
         first, *others = self.algorithm.minibatches(batch)
         with self._precision():  # another one: autocast keeps weights that it converted without gradients
             terms = dict(self.algorithm.losses(first))
@@ -195,31 +210,32 @@ class Trainer:
             raise RuntimeError(
                 "a trainer is saved within collecting(): the environments' state belongs to it"
             )
-        return save_checkpoint(
-            path,
-            {
-                "frames": self.frames,
-                "updates": self.updates,
-                "seconds": self.seconds,
-                "run_id": self.run_id,
-                "validation": dict(self.validation),
-                "scenes": {
-                    "sources": scene_sources(self.settings["scenes"], Path(path).parent),
-                    "names": list(self.scenes.names),
-                    "fingerprint": self.scenes.fingerprint,
-                },
-                "goals": self.goals.cpu(),
-                "config": settings_seen_from(Path(path).parent, self.settings),
-                "overrides": without_places(list(self.overrides)),
-                "agent_config": self.agent.config,
-                "agent": self.agent.state_dict(),
-                "algorithm": self.algorithm.state_dict(),
-                "optimizer": self.optimizer.state_dict(),
-                "collector": collector_state(self._collector),
-                "meter": {"episodes": self.episodes.state_dict(), "terms": self.terms.state_dict()},
-                "rng": random_state(),
+        with self.whole():
+            return save_checkpoint(path, self._content(Path(path).parent, self._collector))
+
+    def _content(self, folder: Path, collector: BaseCollector) -> dict[str, Any]:
+        return {
+            "frames": self.frames,
+            "updates": self.updates,
+            "seconds": self.seconds,
+            "run_id": self.run_id,
+            "validation": dict(self.validation),
+            "scenes": {
+                "sources": scene_sources(self.settings["scenes"], folder),
+                "names": list(self.scenes.names),
+                "fingerprint": self.scenes.fingerprint,
             },
-        )
+            "goals": self.goals.cpu(),
+            "config": settings_seen_from(folder, self.settings),
+            "overrides": without_places(list(self.overrides)),
+            "agent_config": self.agent.config,
+            "agent": self.agent.state_dict(),
+            "algorithm": self.algorithm.state_dict(),
+            "optimizer": self.optimizer.state_dict(),
+            "collector": collector_state(collector),
+            "meter": {"episodes": self.episodes.state_dict(), "terms": self.terms.state_dict()},
+            "rng": random_state(),
+        }
 
     def load_weights(self, state: Mapping[str, Any], path: str | Path = "the checkpoint") -> None:
         """Load a checkpoint's weights and what belongs to them, such as the multiplier; nothing else.
