@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
-from vusfa.cli.sources import Force, check_target, scene_path
+from vusfa.cli.sources import Force, check_target, say_next, scene_path
 
 __all__ = ["network_options", "register"]
 
@@ -110,3 +110,4 @@ def encode(
     typer.echo(f"weights: {network.weights_from}, SHA-256 {network.weights_sha256}")
     if bfloat16 and precision != "bfloat16":
         typer.echo("computed in float32: bfloat16 was not as good for the first batch", err=True)
+    say_next(target)

@@ -71,3 +71,5 @@ def film(
         f"{out}: {name}, from state {ids[0]} to {ids[1]}, {ended} in {len(trail) - 1} actions (shortest path"
         f" {shortest})"
     )
+    if trail[-1] != last:
+        typer.echo("next: more attempts=, or another goal=; the trained goals are the easiest", err=True)

@@ -8,7 +8,7 @@ from typing import Annotated, Any
 
 import typer
 
-from vusfa.cli.sources import Force, check_target
+from vusfa.cli.sources import Force, check_target, say_next
 from vusfa.errors import SceneError
 
 __all__ = ["register"]
@@ -119,6 +119,7 @@ def from_photos(
         )
     typer.echo(f"{target}: {scene.num_states} states, {layout.found}")
     _warn(layout.left_out, scene)
+    say_next(target)
 
 
 def _size(size: str) -> tuple[int, int]:

@@ -44,6 +44,10 @@ def list_agents() -> None:
             f"{name:<16}  {facts['bytes'] / 1e6:.1f} MB  {facts['frames']:>9,} frames"
             f"  success {success:5.1f} %  SPL {spl:5.1f} %  (all goals, 500 actions, exact)"
         )
+    typer.echo(
+        "next: vusfa pretrained show NAME; vusfa film NAME; vusfa run NAME goal=PICTURE camera=FOLDER",
+        err=True,
+    )
 
 
 def show(

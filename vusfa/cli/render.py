@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from vusfa.cli.sources import Force, check_target
+from vusfa.cli.sources import Force, check_target, say_next
 from vusfa.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -114,6 +114,7 @@ def render(
         typer.echo(
             f"{target}: {found.num_states} states, {len(found.cells)} places, {len(room.models)} models"
         )
+        typer.echo(f"next: vusfa scenes render plan={target}", err=True)
         return
 
     from vusfa.cli.resumed import resumed
@@ -134,3 +135,4 @@ def render(
             say=lambda line: typer.echo(line, err=True),
         )
     typer.echo(str(rendered))
+    say_next(target)

@@ -10,7 +10,7 @@ import typer
 
 from vusfa.errors import ConfigError, SceneError
 
-__all__ = ["Force", "check_target", "scene_path", "scene_paths"]
+__all__ = ["Force", "check_target", "say_next", "scene_path", "scene_paths", "scenes_in"]
 
 _ENDINGS = (".h5", ".hdf5")
 
@@ -31,6 +31,14 @@ def check_target(target: Path, force: bool) -> None:
     if target.exists() and not force:
         raise ConfigError(f"{target}: exists; choose another name, or replace it with --force")
     check_folder(target.absolute().parent, "the folder of the file to write")
+
+
+def say_next(target: Path) -> None:
+    """Print, on standard error, what can be done with a scene file that was made."""
+    typer.echo(
+        f"next: vusfa scenes show {target}; vusfa train preset=hindsight scenes=[{target}]",
+        err=True,
+    )
 
 
 def scene_path(source: str | Path) -> Path:

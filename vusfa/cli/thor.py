@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
-from vusfa.cli.sources import Force, check_target
+from vusfa.cli.sources import Force, check_target, say_next
 
 __all__ = ["register"]
 
@@ -97,6 +97,7 @@ def export_thor(
         f"{target}: {room.num_states} states; {left_out} places left out because the agent could not be put"
         f" there, {astray} moves taken for blocked because they ended at no known pose"
     )
+    say_next(target)
 
 
 def _house(scene: str) -> dict[str, Any] | None:

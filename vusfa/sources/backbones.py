@@ -52,8 +52,8 @@ class Backbone:
 
     Args:
         name: as in the table above; for a file, the file's name.
-        layer: whose output is taken.
-        weights_sha256: of the file of weights.
+        layer: the layer whose output is taken.
+        weights_sha256: SHA-256 of the weights.
         preprocessing: how its pictures are prepared.
         network: (n, 3, size, size) float32 to (n, F), or (n, F, h, w), which is then averaged over h and w.
         mixed: whether it can run in bfloat16.
@@ -87,7 +87,7 @@ class Backbone:
         """Features (n, F) float32 of prepared images (n, 3, size, size).
 
         Raises:
-            ConfigError: what the layer gives is no vector and no map for each image.
+            ConfigError: the layer gives neither a vector nor a map per image.
         """
         with torch.autocast(torch.device(self.device).type, torch.bfloat16, enabled=bfloat16):
             found = self.network(images.to(self.device))
@@ -219,7 +219,7 @@ def _load_weights(network: nn.Module, path: Path, wanted_by: str) -> None:
         network.load_state_dict(state)
     except ConfigError:
         raise
-    except Exception as error:  # damaged files come as anything
+    except Exception as error:  # a damaged file may raise anything
         raise ConfigError(f"{path}: are no weights of {wanted_by} ({error}); give its state dict") from error
 
 

@@ -135,7 +135,7 @@ def _reader(pictures: Pictures) -> Callable[[int, int], np.ndarray]:
 
 
 def _digest(read: Callable[[int, int], np.ndarray], num_pictures: int, batch: int) -> str:
-    """SHA-256 of all pictures: what tells this encoding from any other, besides the network."""
+    """SHA-256 of all pictures; with the network it identifies the encoding."""
     digest = hashlib.sha256()
     for first in range(0, num_pictures, batch):
         digest.update(read(first, min(first + batch, num_pictures)).tobytes())

@@ -18,7 +18,7 @@ _BLOCK = 64  # pictures read at a time
 
 @dataclass(frozen=True)
 class Comparison:
-    """Two scenes of as many states, side by side.
+    """Differences of two scenes with equal numbers of states.
 
     Attributes:
         graph: whether every action leads to the same state.
@@ -27,7 +27,7 @@ class Comparison:
         cosine, least_cosine: of a state's features in both, mean and least over the states; None where the
             numbers of crops or features differ.
         pixels, most_pixels: mean absolute difference of the pictures' values 0..255, over all states and in
-            the state where it is largest; None where one has no pictures, or others in size.
+            the state where it is largest; None where one has no pictures or their sizes differ.
     """
 
     graph: bool
@@ -49,10 +49,10 @@ def compare(one: Scene, other: Scene) -> Comparison:
 
     Args:
         one: a scene.
-        other: another with as many states.
+        other: another with the same number of states.
 
     Raises:
-        SceneError: it has not, or pictures cannot be read.
+        SceneError: the numbers of states differ, or pictures cannot be read.
 
     >>> room = Scene.bundled("bathroom")
     >>> found = compare(room, room)
@@ -78,7 +78,7 @@ def compare(one: Scene, other: Scene) -> Comparison:
 
 
 def _cosines(one: Tensor, other: Tensor) -> Tensor | None:
-    """Of (N, C, F) features, crops side by side: (N,)."""
+    """Cosines (N,) of features (N, C, F), all crops of a state concatenated."""
     if one.shape != other.shape:
         return None
     return torch.cosine_similarity(one.flatten(1).double(), other.flatten(1).double(), dim=1)

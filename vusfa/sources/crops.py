@@ -1,14 +1,14 @@
-"""What a network is shown of a picture: resized, cut into crops, normalised.
+"""Preprocessing of pictures for a network: resizing, crops, normalization.
 
 Three ways, ``crops=``:
 
-- ``whole``: the whole picture, squashed to the network's square. The bundled rooms were made so; nothing of a
-  wide picture is lost.
+- ``whole``: the whole picture, resized to the network's square without keeping its aspect ratio. The bundled
+  rooms were made this way.
 - ``centre``: the shorter side is resized to ``resize``, and the square in the middle is cut out: how
   networks trained on ImageNet are tested.
 - ``ten``: of the same resized picture the centre, the top left, top right, bottom left and bottom right
-  corner, and then these five mirrored: ten rows of features a state, of which training draws one. The
-  THOR v1 dumps have ten crops; their order is not known, ours is this one.
+  corner, and then these five mirrored: ten rows of features per state, of which training draws one. The
+  THOR v1 dumps have ten crops, too; their order is not known.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ _FILTERS = {"bicubic": Image.Resampling.BICUBIC, "bilinear": Image.Resampling.BI
 
 @dataclass(frozen=True)
 class Preprocessing:
-    """How pictures are prepared for a network.
+    """Preprocessing of pictures for a network.
 
     Args:
         size: side of the network's square input, pixels.
@@ -44,7 +44,7 @@ class Preprocessing:
         std: that the rest is divided by.
 
     Raises:
-        ConfigError: a value that means nothing.
+        ConfigError: an invalid value.
 
     >>> Preprocessing(size=224).resize
     256
@@ -75,11 +75,11 @@ class Preprocessing:
 
     @property
     def num_crops(self) -> int:
-        """C."""
+        """C, crops per picture."""
         return CROPS[self.crops]
 
     def describe(self) -> str:
-        """One line for people.
+        """Description in one line.
 
         >>> Preprocessing(crops="ten", mean=(0.5, 0.5, 0.5), std=(0.5, 0.5, 0.5)).describe()
         'shorter side to 256, ten crops of 224x224, bilinear; (x/255 - (0.5, 0.5, 0.5)) / (0.5, 0.5, 0.5)'
@@ -116,7 +116,7 @@ def prepare(pictures: np.ndarray, preprocessing: Preprocessing) -> Tensor:
 
     Args:
         pictures: (N, H, W, 3) uint8.
-        preprocessing: how.
+        preprocessing: of the network.
 
     Returns:
         (N * C, 3, size, size) float32, the crops of one picture next to each other.

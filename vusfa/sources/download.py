@@ -1,6 +1,6 @@
-"""One large file over HTTP from servers that stall, break off and come back.
+"""Download of one large file over HTTP from servers that stall or drop the connection.
 
-What has arrived lies beside the target under a temporary name, with a note of where it came from. A later
+What has arrived is kept beside the target under a temporary name, with its address. A later
 attempt, in this run or the next, asks the server for the rest only (``Range``), and only if the file there is
 still the same (``If-Range``); a server that knows neither sends all of it again.
 """
@@ -32,7 +32,7 @@ _MAX_REDIRECTS = 10
 
 @dataclass(frozen=True)
 class Patience:
-    """How long to bear with a server.
+    """Time limits and retries for a server.
 
     Args:
         connect: seconds until it must answer.
@@ -55,13 +55,13 @@ def download(
     progress: Callable[[int, int], None] | None = None,
     sleep: Callable[[float], None] = time.sleep,
 ) -> None:
-    """Fetch a file, going on with what arrived before; the target appears when it is whole.
+    """Download a file, resuming an earlier attempt; the target appears when it is complete.
 
     Args:
         url: where it is.
         target: file to write; beside it lie ``.NAME.part`` and ``.NAME.part.json`` until all has arrived.
         patience: when to try again, and when to give up.
-        progress: called with bytes there and bytes in all (0 when the server does not say).
+        progress: called with bytes received and bytes in total (0 when the server does not say).
         sleep: waits between two tries.
 
     Raises:
@@ -100,7 +100,7 @@ def _never(requests: Any) -> tuple[type[Exception], ...]:
 
 
 class _Refused(Exception):
-    """The server's answer will not change by asking again."""
+    """An answer of the server for which a retry is useless."""
 
 
 class _Part:
@@ -113,7 +113,7 @@ class _Part:
 
     @property
     def size(self) -> int:
-        """Bytes there."""
+        """Bytes received."""
         return self.path.stat().st_size if self.path.exists() else 0
 
     def validator(self, url: str) -> str | None:
@@ -126,17 +126,17 @@ class _Part:
         return validator if isinstance(validator, str) else None
 
     def begin(self, url: str, validator: str | None) -> None:
-        """Start from nothing."""
+        """Start with an empty file."""
         self.path.write_bytes(b"")
         self._note.write_text(json.dumps({"url": url, "validator": validator}))
 
     def finish(self) -> None:
-        """All is there."""
+        """Move the complete file to its target."""
         self.path.replace(self.target)
         self._note.unlink(missing_ok=True)
 
     def discard(self) -> None:
-        """None of it is of use."""
+        """Delete what has arrived."""
         self.path.unlink(missing_ok=True)
         self._note.unlink(missing_ok=True)
 
@@ -144,7 +144,7 @@ class _Part:
 def _transfer(
     requests: Any, url: str, part: _Part, patience: Patience, progress: Callable[[int, int], None]
 ) -> None:
-    """One connection: ask for what is missing, write it as it comes.
+    """One connection: request what is missing, write it as it arrives.
 
     Raises requests' exceptions when the rest has to be asked for again.
     """

@@ -56,13 +56,13 @@ def _checked(pictures: Any) -> np.ndarray:
 
 
 def bfloat16_is_as_good(pictures: Any, backbone: Backbone) -> bool:
-    """Whether a network's features in bfloat16 point where those in float32 do, for these pictures.
+    """Whether a network's features in bfloat16 agree with those in float32, for these pictures.
 
     Every crop's cosine between the two must be 0.999 or more; states that are more alike than that count as
     look-alikes. (EfficientNet-lite0, whose activations are clipped, stays below: about 0.997.)
 
     Args:
-        pictures: (n, H, W, 3) uint8; some will do.
+        pictures: (n, H, W, 3) uint8; a sample is enough.
         backbone: the network.
 
     Raises:
@@ -115,14 +115,14 @@ def encode_in_steps(
     bfloat16: bool = False,
     progress: Progress | None = None,
 ) -> tuple[np.ndarray, dict[str, str], RowLog]:
-    """Features of pictures that are read when their turn comes; every batch is kept in a log.
+    """Features of pictures that are read batch by batch; every finished batch is kept in a log.
 
     Args:
         read: ``read(first, last)`` gives these pictures, (last - first, H, W, 3) uint8.
         num_pictures: N.
         backbone: the network.
-        log_path: where finished features are kept; what lies there from the same work is not computed again.
-        work: what tells this work from any other, besides the network.
+        log_path: where finished features are kept; those of the same work are not computed again.
+        work: what identifies this work, besides the network.
         batch: pictures at a time. A run that was stopped and resumed with the same batch gives the same
             numbers; with another, the same within rounding.
         bfloat16: as for :func:`encode_pictures`.

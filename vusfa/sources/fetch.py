@@ -1,4 +1,4 @@
-"""Scenes that others have published: fetched, unpacked, and looked at before they are let in.
+"""Download of published scenes: they are unpacked and validated before they reach their folder.
 
 There is no published checksum of the THOR v1 dumps. What stands in for it: the archive's own checksums (zip
 has one for each file), the number of states of each room, and all that :func:`vusfa.scenes.validate` looks
@@ -39,7 +39,7 @@ class Archive:
         mirrors: its addresses, in the order in which they are asked.
         scenes: the scenes to take, ``NAME.h5`` anywhere in the archive, and how many states each has.
         patience: how long to bear with a server.
-        about: one line for people.
+        about: one line of description.
     """
 
     name: str
@@ -95,7 +95,7 @@ def _archive(where: str, name: str, entry: dict[str, Any]) -> Archive:
 
 
 def arrived_faults(path: Path, num_states: int) -> list[str]:
-    """What is wrong with a scene file that should have so many states; an empty list for a sound one."""
+    """Faults of a scene file that should have this many states; an empty list for a sound one."""
     faults = store.validate(path, MAX_DECODED_PICTURES)  # damage on the way shows in the archive's CRC
     if not faults:
         with opened(path) as file:
@@ -114,7 +114,7 @@ def fetch(
     say: Callable[[str], None] | None = None,
     sleep: Callable[[float], None] = time.sleep,
 ) -> list[Path]:
-    """Fetch an archive, unpack its scenes, validate them, and only then put them into a folder.
+    """Download an archive, unpack and validate its scenes, and only then move them into a folder.
 
     Stopped at any moment, it goes on where it was when it is called again: a download with the bytes that
     have arrived, and a finished one with unpacking. Scenes that are there and sound are not fetched again.
@@ -123,8 +123,8 @@ def fetch(
         archive: of :func:`archives`.
         folder: where the scenes go; made when it does not exist.
         mirrors: addresses to ask instead of the archive's own.
-        progress: called with bytes there and bytes in all (0 when not known).
-        say: called with a line for people, on what is being done and what went wrong.
+        progress: called with bytes received and bytes in total (0 when not known).
+        say: called with a line on what is being done or what went wrong.
         sleep: waits between two tries.
 
     Returns:
@@ -171,7 +171,7 @@ def fetch(
 
 
 class _Unsound(Exception):
-    """The archive is not what it should be."""
+    """The archive fails a check."""
 
 
 def _admit(packed: Path, archive: Archive, targets: dict[str, Path]) -> None:

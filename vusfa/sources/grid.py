@@ -1,7 +1,7 @@
-"""Graph of poses that lie on a grid: which pose every action leads to.
+"""Graph of poses on a grid: the pose that each action leads to.
 
-Measured poses are a little off. The grid that fits most of them is found first (step, turn, where it lies,
-how it is turned); then every pose takes its nearest grid point, and one too far from any is said to be. In
+Measured poses are inaccurate. The grid that fits most of them is found first (step, turn, where it lies,
+how it is turned); then every pose takes its nearest grid point, and one too far from any is reported. In
 the frame of a scene +Z is heading 0 and +X is heading 90.
 """
 
@@ -63,7 +63,7 @@ def fit_offset(values: np.ndarray, period: float) -> float:
 
 
 def _beyond(values: np.ndarray, period: float) -> np.ndarray:
-    """What is left of the values beyond their nearest multiple of a period."""
+    """Difference of the values from their nearest multiple of a period."""
     return values - period * np.rint(values / period)
 
 
@@ -81,7 +81,7 @@ def fit_turn(rotation: np.ndarray) -> int:
 
 
 def fit_step(location: np.ndarray, heading: np.ndarray) -> float:
-    """Roughly the step of the grid that most places are near.
+    """Rough estimate of the step of the grid.
 
     Poses of one heading have different places, so that their nearest neighbours are one step away: the median
     of these distances.
@@ -96,7 +96,7 @@ def fit_step(location: np.ndarray, heading: np.ndarray) -> float:
     nearest = [np.empty(0)]
     for one in np.unique(heading):
         alike = location[heading == one]
-        # two thousand poses of one heading; more than that say no more
+        # two thousand poses of one heading are enough
         alike = alike[np.lexsort(alike.T)][:2000]
         if len(alike) > 1:
             apart = np.linalg.norm(alike[:, None] - alike[None], axis=-1)
@@ -110,8 +110,8 @@ def fit_lattice(place: np.ndarray, basis: complex, fixed_step: bool = False) -> 
     """The square lattice that most places are near: ``origin + basis * (a + b i)`` for integers a and b.
 
     It is fitted to the places near the middle first, then, by least squares, to more and more of them: a
-    small error of the step or of the angle adds up over a long way, and must be mended before it amounts to a
-    cell.
+    small error of the step or of the angle adds up over distance, and must be corrected before it amounts to
+    a cell.
 
     Args:
         place: (N,) complex, x + z i.
@@ -169,7 +169,7 @@ def put_on_grid(
     turn: int | None = None,
     source: str | os.PathLike[str] = "poses",
 ) -> GridPoses:
-    """Give every pose its grid point and every action its result.
+    """Assign every pose its grid point and every action its result.
 
     MoveForward leads to the next grid point ahead (with a turn of 45, from a diagonal heading to the diagonal
     neighbour), where there is a pose with the same heading; a wall between two such poses is not known here.

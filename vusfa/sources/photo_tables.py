@@ -2,8 +2,8 @@
 
 Poses are a CSV with the columns ``file,x,z,heading``: metres, and degrees where 0 looks along +Z and 90 along
 +X. Edges are a CSV with the columns ``state,action,next``, where states are the files' names and a move
-without a line is blocked. Further columns are passed over. Every fault of a table is said at once, with its
-line.
+without a line is blocked. Further columns are ignored. All faults of a table are reported at once, with
+their lines.
 """
 
 from __future__ import annotations
@@ -85,7 +85,7 @@ def read_poses(path: Path) -> Poses:
 
 
 def edge_states(path: Path) -> tuple[str, ...]:
-    """Names of all states that a table of edges speaks of, sorted.
+    """Names of all states in a table of edges, sorted.
 
     Raises:
         SceneError: the table cannot be read.

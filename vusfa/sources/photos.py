@@ -1,8 +1,8 @@
-"""A folder of photographs to a scene.
+"""Conversion of a folder of photographs to a scene.
 
 The folder's poses or edges say what the states are and where the actions lead (:mod:`vusfa.sources.grid`,
-:mod:`vusfa.sources.photo_tables`). The pictures are turned upright as their cameras noted, cut to one shape
-around their middle, made small, and kept as JPEG files or raw.
+:mod:`vusfa.sources.photo_tables`). The pictures are rotated as their cameras recorded, cropped around their
+center, resized, and kept as JPEG files or raw.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ class Layout(PoseGraph):
 
     Attributes:
         files: N pictures, relative to their folder, in the order of the states.
-        found: what was inferred, for people to see, "a grid of 0.5 m, headings 90 degrees apart".
+        found: description of what was inferred, "a grid of 0.5 m, headings 90 degrees apart".
         left_out: pictures of the folder that are no state.
     """
 
@@ -163,7 +163,7 @@ def read_photos(
     raw: bool = False,
     advance: Callable[[], None] = lambda: None,
 ) -> np.ndarray | list[bytes]:
-    """All pictures, made small.
+    """Read all photographs, cropped and resized.
 
     Args:
         folder: where they are.
@@ -205,7 +205,7 @@ def read_features(path: str | os.PathLike[str], num_states: int) -> np.ndarray:
         (N, C, F) float32.
 
     Raises:
-        SceneError: the file is missing or is none, or its shape does not fit.
+        SceneError: the file is missing or damaged, or its shape does not fit.
     """
     values = read_npy(path, SceneError, "write it with numpy.save")
     if values.dtype.kind not in "fiu" or values.ndim not in (2, 3):

@@ -1,7 +1,7 @@
 """Resumable work: rows of numbers, appended to a file, each with its checksum.
 
 A long command (encoding, exporting) appends every row that it has finished. Stopped and started again, it
-goes on after the last row that arrived whole; a row that was torn by the stop is dropped. When the product
+continues after the last complete row; an incomplete row is dropped. When the product
 is written, the log is removed.
 """
 
@@ -41,7 +41,7 @@ def file_sha256(path: str | os.PathLike[str]) -> str:
 
 
 class RowLog:
-    """Rows of one dtype in a file that grows.
+    """Log of rows of one dtype in a file.
 
     Args:
         path: the log; made when it does not exist.
@@ -71,7 +71,7 @@ class RowLog:
             raise SceneError(f"{self.path}: cannot be written ({error}); check folder and rights") from error
 
     def _sound_rows(self) -> int:
-        """Count the rows that arrived whole and cut off what follows them."""
+        """Count the complete rows and cut off what follows them."""
         if not self.path.exists() or not self._same_work():
             self.path.write_bytes(self._head)
             return 0
@@ -136,5 +136,5 @@ class RowLog:
             self._length = rows
 
     def remove(self) -> None:
-        """The work is done: delete the file."""
+        """Delete the file."""
         self.path.unlink(missing_ok=True)

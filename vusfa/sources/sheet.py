@@ -1,4 +1,4 @@
-"""One picture that shows a scene: what is seen from poses all over the room, and its floor with the poses.
+"""Overview of a scene as one picture: views from all over the room beside the map of its poses.
 
 Needs matplotlib: ``pip install 'vusfa[scenes]'``.
 """
@@ -91,7 +91,7 @@ def save_sheet(scene: Scene, path: str | os.PathLike[str], count: int = 12) -> P
 
 
 def _choose(scene: Scene, count: int) -> list[int]:
-    """Poses all over the room; where there are enough, such as can move ahead: they see more than a wall."""
+    """Poses all over the room; where there are enough, those that can move ahead."""
     candidates = torch.arange(scene.num_states)
     if "MoveForward" in scene.actions:
         free = (scene.graph[:, scene.actions.index("MoveForward")] >= 0).nonzero().squeeze(1)

@@ -29,7 +29,7 @@ class Summary:
     Attributes:
         name: the scene's.
         states, cells, actions, crops, features: how many poses, distinct places, actions, crops of each
-            picture, and numbers a crop.
+            picture, and numbers per crop.
         islands: how many parts of the graph are cut off from the largest.
         look_alikes: share of states that some other state looks like (:func:`look_alike_share`).
         picture_shape: (H, W, 3), or None.
@@ -114,7 +114,7 @@ def look_alike_share(features: np.ndarray) -> float:
 
 @dataclass(frozen=True)
 class Group:
-    """How distinguishable the states of all scenes of one name are.
+    """Look-alikes over all scenes of one name.
 
     Attributes:
         name: theirs.
@@ -132,7 +132,7 @@ class Group:
 
 
 def by_name(found: Sequence[Summary]) -> list[Group]:
-    """Scenes of the same name together, in the order in which names come first.
+    """Look-alikes per name of a scene, in the order in which the names appear.
 
     >>> room = summarize(Scene.bundled("bathroom"))
     >>> by_name([room, dataclasses.replace(room, look_alikes=0.5)])

@@ -7,7 +7,7 @@ It calls ``GetReachablePositions``, ``Teleport``, ``MoveAhead``, ``RotateRight``
 ``errorMessage`` and ``agent``. The simulator's build cannot be had everywhere: this package's tests drive the
 exporter with a stand-in controller that serves a bundled room through the same calls, not with the simulator.
 
-The graph is what happened, not what geometry promises: from every pose each action is taken once, and leads
+The graph is measured, not derived from geometry: from every pose each action is taken once, and leads
 to the pose where the agent was found afterwards. The simulator's list of reachable positions is not trusted
 either: a place where it refuses to put the agent in any heading is left out.
 """
@@ -44,7 +44,7 @@ _TURN = 2.0  # degrees by which a heading may be off
 
 
 class Controller(Protocol):
-    """What is asked of a simulator."""
+    """The part of a simulator that the export needs."""
 
     def step(self, *, action: str, **arguments: Any) -> Any:
         """Take an action; an event with ``metadata`` and ``frame`` (H, W, 3) uint8."""
@@ -77,7 +77,7 @@ def export(
         horizon: degrees that the camera looks down.
         backbone: a network of :func:`vusfa.sources.backbones.load_backbone`, or its name.
         batch: pictures that are encoded at a time.
-        attributes: what else the file should say of its origin.
+        attributes: further attributes on the origin.
         versions: of the simulator, for ``made_with``.
         visited: called with poses visited and poses in all.
         encoded: called with pictures encoded and pictures in all.

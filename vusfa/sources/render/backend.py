@@ -1,7 +1,7 @@
 """Which of Mitsuba's variants to render with: LLVM where one is found that works, otherwise plain C++.
 
 LLVM is several times faster, but some versions of it crash (LLVM 15 does with Mitsuba 3.9), so each candidate
-first traces a small scene in a process of its own. ``DRJIT_LIBLLVM_PATH`` names one to try first. The scalar
+first renders a small scene in a process of its own. ``DRJIT_LIBLLVM_PATH`` names one to try first. The scalar
 variant's threads hinder each other: two take almost three times as long as one, so that it is given one.
 """
 
@@ -94,7 +94,7 @@ def works(library: str) -> bool:
 
 @cache
 def choose_backend() -> Backend:
-    """The fastest variant that works here; found once in a process."""
+    """The fastest variant that works here; determined once per process."""
     for library in llvm_libraries():
         if works(library):
             return Backend("llvm_ad_rgb", library)

@@ -1,4 +1,4 @@
-"""Furniture from the Sweet Home 3D libraries: what there is, its size, who made it, under which licence.
+"""Furniture from the Sweet Home 3D libraries: models, sizes, authors and licences.
 
 The libraries are ``.sh3f`` files, which are zip archives with a catalogue of properties inside; Debian's
 package ``sweethome3d-furniture`` puts five of them into ``/usr/share/sweethome3d/furniture``. They are read
@@ -156,7 +156,7 @@ def furniture_folder() -> Path | None:
 
 
 def _properties(text: str) -> dict[str, str]:
-    r"""Java properties, one a line; ``\uXXXX`` as the character.
+    r"""Java properties, one per line; ``\uXXXX`` as the character.
 
     >>> _properties("# comment\nname#1=Caf\\u00e9 table\n")
     {'name#1': 'Café table'}

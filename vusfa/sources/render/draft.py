@@ -102,7 +102,7 @@ class Draft:
 
     @property
     def obstacles(self) -> list[Rect]:
-        """What one cannot walk through."""
+        """Rectangles that block walking."""
         return [*self.solids, *(item.rect for item in (*self.items, *self.fixtures) if item.blocks)]
 
     def inside(self, rect: Rect) -> bool:

@@ -1,4 +1,4 @@
-"""The frames of a room, kept as they are rendered, so that the work can be stopped at any moment.
+"""Frames of a room, saved one by one, so that rendering can be stopped at any moment.
 
 The exposure is measured from some frames of all over the room, which are rendered first and kept as they are:
 resumed or not, the pictures come out the same.
@@ -59,7 +59,7 @@ class Frames:
 
     @property
     def complete(self) -> bool:
-        """Whether all are there."""
+        """Whether all frames are rendered."""
         return len(self._probes) == len(self._probed) and len(self._frames) == self._room.num_states
 
     @property
@@ -72,7 +72,7 @@ class Frames:
         return exposure_of(self._probes.read()) if self._given is None else self._given
 
     def render(self, frame: FrameOf, report: Callable[[], None]) -> None:
-        """Render what is not there yet.
+        """Render the missing frames.
 
         Args:
             frame: renders one.
@@ -103,6 +103,6 @@ class Frames:
         return self._frames.read(first, last)
 
     def remove(self) -> None:
-        """The product is written: delete the logs."""
+        """Delete the logs."""
         self._probes.remove()
         self._frames.remove()

@@ -18,7 +18,7 @@ from vusfa.sources.render.surfaces import Textures, draw_textures
 
 __all__ = ["build_scene"]
 
-# Off the wall by so much: pictures hang in front of it, views behind a window's frame.
+# Distance from the wall: pictures hang in front of it, views behind a window's frame.
 _PICTURE_OUT, _VIEW_OUT = 0.02, 0.01
 
 

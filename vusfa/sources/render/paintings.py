@@ -10,7 +10,7 @@ from vusfa.sources.render.textures import blotches, from_hsv, random_stream
 
 __all__ = ["painting", "view"]
 
-_PIXELS = 260  # a metre
+_PIXELS = 260  # pixels per metre
 _FRAME = 0.03
 
 
