@@ -1,11 +1,12 @@
 """Algorithms: the losses of a batch, of replay, and what follows a step; a registry of them.
 
 >>> sorted(ALGORITHMS)
-['autoencoder', 'hindsight', 'usf']
+['autoencoder', 'hindsight', 'replay_search', 'usf']
 """
 
 from vusfa.algorithms.autoencoder import Autoencoder
 from vusfa.algorithms.base import Algorithm, AlgorithmSettings
+from vusfa.algorithms.experience import ExperienceGraph
 from vusfa.algorithms.hindsight import Hindsight
 from vusfa.algorithms.registry import (
     ALGORITHMS,
@@ -16,6 +17,7 @@ from vusfa.algorithms.registry import (
     register_loss_term,
 )
 from vusfa.algorithms.replay import HindsightReplay, HindsightSampler
+from vusfa.algorithms.replay_search import ReplaySearch
 from vusfa.algorithms.schedule import annealed, threads_per_step
 from vusfa.algorithms.usf import USF, make_usf_loss
 
@@ -26,9 +28,11 @@ __all__ = [
     "Algorithm",
     "AlgorithmSettings",
     "Autoencoder",
+    "ExperienceGraph",
     "Hindsight",
     "HindsightReplay",
     "HindsightSampler",
+    "ReplaySearch",
     "annealed",
     "make_algorithm",
     "make_loss_terms",

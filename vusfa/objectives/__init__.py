@@ -16,6 +16,7 @@ from vusfa.objectives.hindsight import HindsightLoss, expectile_loss, relabelled
 from vusfa.objectives.optim import DualAscent, TFRMSprop
 from vusfa.objectives.returns import USFEstimator
 from vusfa.objectives.reward import RewardRegressionLoss, reward_regression_loss
+from vusfa.objectives.search import SearchLoss, best_action_log_prob
 from vusfa.objectives.usf import USFLoss
 
 __all__ = [
@@ -23,9 +24,11 @@ __all__ = [
     "DualAscent",
     "HindsightLoss",
     "RewardRegressionLoss",
+    "SearchLoss",
     "TFRMSprop",
     "USFEstimator",
     "USFLoss",
+    "best_action_log_prob",
     "dual_ascent",
     "expectile_loss",
     "explained_variance",

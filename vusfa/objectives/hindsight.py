@@ -21,7 +21,7 @@ from torch import Tensor
 
 from vusfa.objectives.distribution import action_log_prob
 from vusfa.objectives.functional import assert_same_shape
-from vusfa.objectives.network_loss import NetworkLoss
+from vusfa.objectives.network_loss import NetworkLoss, weighted_mean
 from vusfa.objectives.networks import entry, run_actor_critic, run_critic, select_inputs
 
 __all__ = ["HindsightKeys", "HindsightLoss", "expectile_loss", "relabelled_target", "walked_return"]
@@ -258,25 +258,7 @@ class HindsightLoss(NetworkLoss):
         if self.objective_coeff is not None:
             log_prob = action_log_prob(distribution, tensordict, keys.action)
             out.set("loss_hindsight_objective", self._weighted(self.objective_coeff, -log_prob, weight))
-        out.set("hindsight_value", _mean(1.0, value.detach(), counts))
-        out.set("hindsight_advantage", _mean(1.0, advantage, counts))
+        out.set("hindsight_value", weighted_mean(1.0, value.detach(), counts))
+        out.set("hindsight_advantage", weighted_mean(1.0, advantage, counts))
         self._clear_weakrefs(tensordict, out, "actor_network_params", "critic_network_params")
         return out
-
-    def _value(self, written: TensorDictBase) -> Tensor:
-        """V, (*batch,), float32 or more."""
-        value = written.get(self.tensor_keys.value).squeeze(-1)
-        return value.to(torch.promote_types(value.dtype, torch.float32))
-
-    def _weighted(self, coefficient: Tensor, values: Tensor, weight: Tensor) -> Tensor:
-        if self.reduction == "mean":
-            return _mean(coefficient, values, weight)
-        # select, not multiply: what a mask hides may be infinite
-        values = coefficient * (weight * torch.where(weight > 0, values, 0.0))
-        return values if self.reduction == "none" else values.sum()
-
-
-def _mean(coefficient: float | Tensor, values: Tensor, weight: Tensor) -> Tensor:
-    """The weighted mean, times a coefficient; 0 where every weight is 0."""
-    total = (weight * torch.where(weight > 0, values, 0.0)).sum()
-    return coefficient * total / weight.sum().clamp(min=torch.finfo(weight.dtype).tiny)

@@ -180,7 +180,7 @@ def row_name(settings: Mapping[str, Any]) -> str:
         "autoencoder": agent.get("pretrained") == "autoencoder",
     }
     name = ", ".join([agent["model"], *(part for part, present in parts.items() if present)])
-    return name if algorithm in ("usf", "autoencoder") else f"{name} + {algorithm}"
+    return name if algorithm in ("usf", "autoencoder") else f"{name} + {algorithm.replace('_', ' ')}"
 
 
 def set_threads(threads: int) -> None:

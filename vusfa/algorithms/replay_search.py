@@ -1,0 +1,134 @@
+"""The paper's algorithm, and shortest paths found in the agent's own transitions."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from vusfa.algorithms.base import AlgorithmSettings
+from vusfa.algorithms.experience import ExperienceGraph
+from vusfa.algorithms.registry import register_algorithm
+from vusfa.algorithms.usf import USF
+from vusfa.errors import CheckpointError, ConfigError
+from vusfa.modules import Agent
+from vusfa.objectives.search import SearchLoss
+from vusfa.scenes import SceneSet
+
+__all__ = ["ReplaySearch", "ReplaySearchSettings"]
+
+
+@dataclass
+class ReplaySearchSettings(AlgorithmSettings):
+    """Numbers of ``algorithm=replay_search``.
+
+    Attributes:
+        updates: optimizer steps per batch of the collector.
+        batch_size: pairs of a state and a goal in each of these steps.
+        num_goals: goals among these pairs.
+        path_share: share of the states that are drawn as walks to the goal pass them, the others uniformly.
+        learning_starts: frames of walking before the first search. A policy that has learned shortest paths
+            tries nothing else, so every action should have been tried by then.
+        critic_coeff, objective_coeff: of :class:`~vusfa.objectives.SearchLoss`.
+    """
+
+    updates: int = 10
+    batch_size: int = 8192
+    num_goals: int = 32
+    path_share: float = 0.5
+    learning_starts: int = 100_000
+    critic_coeff: float = 1.0
+    objective_coeff: float = 1.0
+
+
+@register_algorithm("replay_search")
+class ReplaySearch(USF):
+    """:class:`~vusfa.algorithms.USF`, and :class:`~vusfa.objectives.SearchLoss` on pairs of states and goals
+    from an :class:`~vusfa.algorithms.ExperienceGraph` of all transitions so far.
+
+    The first of ``algorithm.updates`` steps learns from the batch, too: its gradient is that of both losses.
+    """
+
+    Settings = ReplaySearchSettings
+
+    def __init__(self, agent: Agent, scenes: SceneSet, settings: Mapping[str, Any]) -> None:
+        super().__init__(agent, scenes, settings)
+        numbers = self._numbers = settings["algorithm"]
+        for name in ("updates", "num_goals"):
+            if numbers[name] < 1:
+                raise ConfigError(f"algorithm.{name} is {numbers[name]}; give 1 or more")
+        if numbers["batch_size"] < numbers["num_goals"]:
+            raise ConfigError(
+                f"algorithm.batch_size is {numbers['batch_size']} for {numbers['num_goals']} goals; give one"
+                " pair per goal or more"
+            )
+        if not 0 <= numbers["path_share"] <= 1 or numbers["learning_starts"] < 0:
+            raise ConfigError(
+                f"algorithm.path_share is {numbers['path_share']} and algorithm.learning_starts"
+                f" {numbers['learning_starts']}; give a number between 0 and 1, and 0 or more"
+            )
+        if agent.config["observation"] != "index" or agent.config["memory"] or agent.config["history"] != 1:
+            raise ConfigError(
+                "replay_search makes pairs of a state and a goal by their ids, for an agent that reads one id"
+                " and has no memory; give agent.observation=index, agent.memory=null and agent.history=1, or"
+                " algorithm=usf"
+            )
+        if self.threads is not None:
+            raise ConfigError(
+                "optim.kind=a3c_rmsprop makes an update per environment of a batch, and pairs of states and"
+                " goals have none; give optim=adam, or algorithm=usf"
+            )
+        self.graph = ExperienceGraph(scenes.num_states, scenes.num_actions)
+        actor, critic = agent.get_policy_operator(), agent.get_value_operator()
+        rewards = {name: settings["env"][name] for name in ("goal_reward", "step_reward")}
+        coefficients = {name: numbers[name] for name in ("critic_coeff", "objective_coeff")}
+        try:
+            self.search_loss = SearchLoss(
+                actor,
+                critic,
+                **coefficients,
+                **rewards,
+                gamma=settings["objective"]["gamma"],
+                functional=False,
+            )
+        except ValueError as error:
+            raise ConfigError(f"replay_search: {error}") from error
+        self.search_loss.to(next(agent.parameters()).device)
+
+    def schedule(self, frames: int) -> None:
+        """Begin to search after ``learning_starts``."""
+        super().schedule(frames)
+        begun = frames >= self._numbers["learning_starts"]
+        self.replay_steps = self._numbers["updates"] - 1 if begun else 0
+        self._searches = begun
+
+    def losses(self, batch: TensorDictBase) -> dict[str, Tensor]:
+        """On-policy terms, and those of pairs from a graph that has the batch."""
+        terms = super().losses(batch)
+        self.graph.extend(batch)
+        if not self._searches:
+            return terms
+        # converted weights are not shared with the on-policy terms: gradients would be added in bfloat16
+        torch.clear_autocast_cache()
+        return {**terms, **self.replay_losses()}
+
+    def replay_losses(self) -> dict[str, Tensor]:
+        """Terms of a sample of pairs."""
+        numbers = self._numbers
+        pairs = self.graph.sample(numbers["num_goals"], numbers["batch_size"], numbers["path_share"])
+        return dict(self.search_loss(pairs.to(next(self.agent.parameters()).device)).items())
+
+    def state_dict(self) -> dict[str, Any]:
+        """The loss's buffers, and the graph."""
+        return {**super().state_dict(), "experience": self.graph.state_dict()}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Continue with the graph; a ``CheckpointError`` where the state has none."""
+        super().load_state_dict(state)
+        if not state.get("experience"):
+            raise CheckpointError("of a training without replay_search; give algorithm=usf")
+        self.graph.load_state_dict(state["experience"])
