@@ -1,9 +1,9 @@
 r"""Distillation of known shortest paths into a policy and its value.
 
-Where all the first steps of shortest paths between a state and a goal are known, from a graph of an agent's
-own transitions (Eysenbach et al., 2019, https://arxiv.org/abs/1906.05253, search such a graph while they act),
-a policy can be told all of them at once, and V needs no bootstrapping: the return of a path of known length is
-known (:func:`~vusfa.objectives.walked_return`).
+Eysenbach et al. (2019, https://arxiv.org/abs/1906.05253) search a graph of replayed states while they act. Here
+the search ends in training: a graph of the agent's own transitions gives all the first steps of shortest paths
+between a state and a goal, which the policy learns at once, and the length of these paths. The return of a path
+of known length is known (:func:`~vusfa.objectives.walked_return`): V needs no bootstrapping.
 """
 
 from __future__ import annotations
@@ -69,8 +69,8 @@ class SearchLoss(NetworkLoss):
 
     k is the length of the shortest known path from s to g, R its return
     (:func:`~vusfa.objectives.walked_return`), A* the actions that begin such a path
-    (:func:`best_action_log_prob`). Rows without a path, and rows that a mask hides, count for nothing. Modules
-    that actor and critic both hold run once.
+    (:func:`best_action_log_prob`). Rows without a path, and rows that a mask hides, count for nothing.
+    Modules that actor and critic both hold run once.
 
     Args:
         actor_network: the policy, with ``get_dist``; its distribution is categorical (has ``logits``).
@@ -192,7 +192,7 @@ def _logits(distribution: Distribution) -> Tensor:
     logits = getattr(distribution, "logits", None)
     if logits is None:
         raise TypeError(
-            f"SearchLoss: the policy's distribution is {type(distribution).__name__}, which has no logits; give"
-            " a policy over a finite set of actions"
+            f"SearchLoss: the policy's distribution is {type(distribution).__name__}, which has no logits;"
+            " give a policy over a finite set of actions"
         )
     return logits.to(torch.promote_types(logits.dtype, torch.float32))
