@@ -140,6 +140,9 @@ def test_a_state_of_another_algorithm_is_refused(make_scene: Callable[..., Scene
     hindsight = trainer_of("algorithm=hindsight").algorithm
     with pytest.raises(CheckpointError, match="of a training without hindsight"):
         hindsight.load_state_dict(trainer_of().algorithm.state_dict())
+    search = trainer_of("algorithm=replay_search", "agent.history=1").algorithm
+    with pytest.raises(CheckpointError, match="of a training without replay_search"):
+        search.load_state_dict(trainer_of().algorithm.state_dict())
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""What TorchRL's generic tests ask of a loss module, of HindsightLoss and RewardRegressionLoss."""
+"""What TorchRL's generic tests ask of a loss module, of every loss but USFLoss."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from torchrl.envs.utils import ExplorationType, exploration_type, set_exploratio
 from torchrl.objectives.common import LossModule
 
 from vusfa.modules import make_agent
-from vusfa.objectives import HindsightLoss, RewardRegressionLoss, USFLoss
+from vusfa.objectives import HindsightLoss, RewardRegressionLoss, SearchLoss, USFLoss
 from vusfa.scenes import SceneSet
 
 STATES, SIZE = 6, 4
@@ -62,6 +62,7 @@ def transitions(*batch: int, **names: Any) -> TensorDict:
         "steps_to_goal": torch.randint(4, batch),
         ("next", "state_id"): torch.randint(STATES, (*batch, 2)),
         ("next", "reward"): torch.randn(*batch, 1),
+        "best_action": torch.rand(*batch, 3) < 0.5,
     }
     td = TensorDict({}, batch)
     for name, value in entries.items():
@@ -87,6 +88,12 @@ CASES = {
         ["loss_hindsight_critic", "loss_hindsight_objective"],
         ["critic_coeff", "objective_coeff"],
         ("hindsight_value", "hindsight_advantage"),
+    ),
+    "search": Case(
+        SearchLoss,
+        ["loss_search_critic", "loss_search_objective"],
+        ["critic_coeff", "objective_coeff"],
+        ("search_accuracy",),
     ),
     "reward": Case(
         lambda actor, critic, **kwargs: RewardRegressionLoss(critic, **kwargs),
@@ -230,9 +237,11 @@ def test_what_a_mask_hides_does_not_count(case: Case, reduction: str, mask_key: 
 def test_a_batch_of_which_nothing_counts_gives_zero() -> None:
     td = transitions(4)
     td["goal_id"] = td["state_id"][:, -1]
-    losses = make(CASES["hindsight"])(td)
-    assert not any(bool(value) for value in losses.values())
-    total(losses).backward()
+    td["steps_to_goal"] = torch.zeros_like(td["steps_to_goal"])
+    for name in ("hindsight", "search"):
+        losses = make(CASES[name])(td)
+        assert not any(bool(value) for value in losses.values())
+        total(losses).backward()
 
 
 RENAMED = {
@@ -240,6 +249,7 @@ RENAMED = {
     "goal_id": "target",
     "action": ("agent", "action"),
     "steps_to_goal": "way",
+    "best_action": ("search", "best"),
     "reward": "payment",
     "state_embedding": "phi",
     "reward_weights": ("head", "omega"),
@@ -252,6 +262,7 @@ KEYS = {
         "steps_to_goal": "way",
         "value": ("head", "v"),
     },
+    "search": {"best_action": ("search", "best"), "steps_to_goal": "way", "value": ("head", "v")},
     "reward": {"reward": "payment", "state_embedding": "phi", "reward_weights": ("head", "omega")},
 }
 
@@ -278,7 +289,7 @@ def test_every_entry_can_be_renamed(name: str, functional: bool) -> None:
 
 def test_misspelt_entries_are_named(case: Case) -> None:
     """A critic that writes the entry under another name, and no set_keys."""
-    key = "state_value" if case.make is HindsightLoss else "reward_weights"
+    key = "state_value" if case.make in (HindsightLoss, SearchLoss) else "reward_weights"
     with pytest.raises(ValueError, match=rf"the critic writes no '{key}', but .*set_keys"):
         make(case, {key: key[:-1]})(transitions(3))
 
@@ -298,6 +309,8 @@ def test_a_state_that_the_critic_does_not_read_is_named() -> None:
         ("hindsight", "action", "no 'action'"),
         ("hindsight", "goal_id", "no 'goal_id'"),
         ("hindsight", ("next", "state_id"), r"no \('next', 'state_id'\).*compact_obs=False"),
+        ("search", "steps_to_goal", "no 'steps_to_goal'"),
+        ("search", "best_action", "no 'best_action'"),
         ("reward", ("next", "reward"), r"no \('next', 'reward'\)"),
         ("reward", ("next", "state_id"), "none of .*compact_obs=False"),
         ("reward", "goal_id", "no 'goal_id'"),

@@ -46,13 +46,15 @@ def assert_equal(one, other, where: str = "") -> None:
         ["agent.model=usfa", "agent=lstm", "env.goal_sampling=episode"],
         ["agent.model=sfdp", "autocast=true"],
         ["agent.model=vusfa", "algorithm=hindsight", "hindsight.batch_size=16", "hindsight.updates=2"],
+        ["agent.model=usfa", "agent.history=1", "algorithm=replay_search", "algorithm.updates=2"]
+        + ["algorithm.batch_size=16", "algorithm.num_goals=4", "algorithm.learning_starts=40"],
     ],
-    ids=["vusfa", "gvf", "lstm", "autocast", "hindsight"],
+    ids=["vusfa", "gvf", "lstm", "autocast", "hindsight", "replay_search"],
 )
 def test_resumed_equals_uninterrupted(
     recipe, settings, small, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, options: list[str]
 ):
-    if "agent=lstm" in options:
+    if "agent=lstm" in options or "agent.history=1" in options:
         small.remove("agent.history=2")
     module = recipe("train")
 

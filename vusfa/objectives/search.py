@@ -1,9 +1,9 @@
 r"""Distillation of known shortest paths into a policy and its value.
 
-Eysenbach et al. (2019, https://arxiv.org/abs/1906.05253) search a graph of replayed states while they act. Here
-the search ends in training: a graph of the agent's own transitions gives all the first steps of shortest paths
-between a state and a goal, which the policy learns at once, and the length of these paths. The return of a path
-of known length is known (:func:`~vusfa.objectives.walked_return`): V needs no bootstrapping.
+Eysenbach et al. (2019, https://arxiv.org/abs/1906.05253) search a graph of replayed states while they act.
+Here the search ends in training: a graph of the agent's own transitions gives all the first steps of
+shortest paths between a state and a goal, which the policy learns at once, and the length of these paths. The
+return of a path of known length is known (:func:`~vusfa.objectives.walked_return`): V needs no bootstrapping.
 """
 
 from __future__ import annotations
