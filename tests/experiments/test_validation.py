@@ -198,7 +198,7 @@ def test_an_agent_below_the_random_walk_gets_advice(
     train(made(f"algorithm={algorithm}", "hindsight.batch_size=8"))
     line = capsys.readouterr().err.splitlines()[-1]
     assert "below the random walk: the agent reaches 25.0 % of the validation goals, a random walk 7" in line
-    assert ("preset=hindsight" in line) == (algorithm == "usf")
+    assert ("preset=replay_search" in line) == (algorithm == "usf")
     assert ("total_frames" in line) == (algorithm == "hindsight")
 
 

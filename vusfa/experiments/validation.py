@@ -131,8 +131,8 @@ class Validation:
                 )
         if not found:
             return None
-        remedy = "begin a new training with preset=hindsight, which learns to reach every state"
-        if self._trainer.settings["algorithm"]["name"] == "hindsight":
+        remedy = "begin a new training with preset=replay_search, which learns to reach every state"
+        if self._trainer.settings["algorithm"]["name"] in ("hindsight", "replay_search"):
             remedy = "train for longer: give a larger total_frames beside resume"
         within = f"within {self.max_steps} steps"
         return f"below the random walk: the agent reaches {found.popitem()[1]} {within}; {remedy}"
