@@ -37,6 +37,7 @@ def of_others(piece: str) -> str | None:
 
 
 @pytest.mark.filterwarnings("ignore:`.* is set to None:UserWarning")  # who made the data, says Minari
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # it leaves a folder to Python
 @pytest.mark.parametrize("library", ["minari", "ray"])
 def test_pieces_with_other_libraries(library: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (piece,) = (piece for piece in PIECES if of_others(piece) == library)

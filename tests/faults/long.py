@@ -49,7 +49,21 @@ is read is resumed and trained on.
 | what is done | how often | what must hold | faults |
 |---|---:|---|---:|
 {endings}
+
+## What is refused when
+
+- *Pictures of a scene.* Opening a scene decodes one. `vusfa scenes check` and `vusfa scenes fetch` first look at the header and the
+  end of every picture, so that one that is cut off, of another size or no picture is found in seconds, wherever it lies. Then
+  `check` decodes all of them: it is asked for everything, and in a large room takes longer than 10 seconds to find damage in the
+  middle of a picture. `fetch` decodes 500, evenly spaced, for the archive's checksums have told of damage on the way.
+- *Features* are read, checked and written some rows at a time and take the memory of float32. Where that is more than 768 MiB beyond
+  the file's size (float16, compressed), the scene is refused; stored as float32 it is read.
+- *Devices.* `agent.to("cuda")`, `loss.to("cuda")` and `env.to("cuda")` without CUDA raise torch's own error, which says what is
+  missing; a setting or an argument `device` raises ours.
+- *Weights & Biases on a full disk.* {wandb}
 """
+
+WANDB = ""
 
 
 def damaged_files(count: int, seed: int) -> Iterator[tuple[str, int]]:
