@@ -28,8 +28,11 @@ SMALL = [
 ]  # fmt: skip
 
 
-def start(folder: Path, *overrides: str, prepare: Callable[[], object] = lambda: None) -> int:
-    """Begin a training in a process, and a process group, of its own; its output goes to ``FOLDER.txt``.
+def start(
+    folder: Path, *overrides: str, prepare: Callable[[], object] = lambda: None, output: Path | None = None
+) -> int:
+    """Begin a training in a process, and a process group, of its own; its output goes to ``FOLDER.txt``, or
+    to ``output``.
 
     Returns:
         the process's number.
@@ -41,9 +44,9 @@ def start(folder: Path, *overrides: str, prepare: Callable[[], object] = lambda:
     code: object = 70
     try:
         os.setsid()
-        output = os.open(folder.with_suffix(".txt"), os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
-        os.dup2(output, 1)
-        os.dup2(output, 2)
+        written = os.open(output or folder.with_suffix(".txt"), os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
+        os.dup2(written, 1)
+        os.dup2(written, 2)
         sys.stdout = sys.stderr = open(2, "w", closefd=False)  # noqa: SIM115
         for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
             signal.signal(number, signal.default_int_handler if number == signal.SIGINT else signal.SIG_DFL)

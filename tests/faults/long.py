@@ -30,7 +30,7 @@ this page; a quick form is in `make test` (`tests/faults`). A *fault* is a trace
 than 10 seconds of computing), more than a gigabyte of memory beyond the file's size, or lost learning.
 
 This page is from {mutations:,} damaged files, {kills} kills, {disks} full disks and a soak of {minutes:g}
-minutes, with seed {seed}.
+minutes, with seed {seed}, on {date}.
 
 ## Damaged files
 
@@ -52,18 +52,21 @@ is read is resumed and trained on.
 
 ## What is refused when
 
-- *Pictures of a scene.* Opening a scene decodes one. `vusfa scenes check` and `vusfa scenes fetch` first look at the header and the
-  end of every picture, so that one that is cut off, of another size or no picture is found in seconds, wherever it lies. Then
-  `check` decodes all of them: it is asked for everything, and in a large room takes longer than 10 seconds to find damage in the
-  middle of a picture. `fetch` decodes 500, evenly spaced, for the archive's checksums have told of damage on the way.
-- *Features* are read, checked and written some rows at a time and take the memory of float32. Where that is more than 768 MiB beyond
-  the file's size (float16, compressed), the scene is refused; stored as float32 it is read.
-- *Devices.* `agent.to("cuda")`, `loss.to("cuda")` and `env.to("cuda")` without CUDA raise torch's own error, which says what is
-  missing; a setting or an argument `device` raises ours.
-- *Weights & Biases on a full disk.* {wandb}
+- *Pictures of a scene.* Opening a scene decodes one. `vusfa scenes check` and `vusfa scenes fetch` first
+  look at the header and the end of every picture, so that one that is cut off, of another size or no
+  picture is found in seconds, wherever it lies. Then `check` decodes all of them: it is asked for
+  everything, and in a large room takes longer than 10 seconds to find damage in the middle of a picture.
+  `fetch` decodes 500, evenly spaced, for the archive's checksums have told of damage on the way.
+- *Features* are read, checked and written some rows at a time and take the memory of float32. Where that
+  is more than 768 MiB beyond the file's size (float16, compressed), the scene is refused; stored as
+  float32 it is read.
+- *Devices.* `agent.to("cuda")`, `loss.to("cuda")` and `env.to("cuda")` without CUDA raise torch's own
+  error, which says what is missing; a setting or an argument `device` raises ours.
+- *Weights & Biases on a full disk.* A tracker that fails is left behind with a warning; where the
+  checkpoint has no place either, the run ends with one line, exit code 1 and the checkpoint before
+  (`tests/faults/test_endings.py` fills a disk in memory). Offline, W&B copies every checkpoint for `wandb
+  sync`: such runs want a larger `checkpoint_every`.
 """
-
-WANDB = ""
 
 
 def damaged_files(count: int, seed: int) -> Iterator[tuple[str, int]]:
@@ -173,6 +176,7 @@ def main() -> int:
     total += sum(faults for _, faults in rows)
     numbers = {
         **vars(given),
+        "date": time.strftime("%Y-%m-%d"),
         "mutations": -(-given.mutations // len(NAMES)) * len(NAMES),
         "kills": each * len(COLLECTORS),
     }

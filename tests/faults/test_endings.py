@@ -5,6 +5,8 @@ from __future__ import annotations
 import os
 import resource
 import signal
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -39,6 +41,27 @@ def test_a_disk_that_is_full(tmp_path: Path):
     assert (tmp_path / "other.txt").read_text().splitlines()[-1].endswith("there is no checkpoint yet")
     assert ended(start(path.parent, "total_frames=96", "resume=auto")) == 0
     assert load_checkpoint(path)["frames"] == 96
+
+
+def test_a_disk_that_is_really_full(tmp_path: Path):
+    """With W&B, whose files lie beside the run's, and whose copies of checkpoints take the space first."""
+    pytest.importorskip("wandb")
+    disk = tmp_path / "disk"
+    disk.mkdir()
+    if subprocess.run(
+        ["mount", "-t", "tmpfs", "-o", "size=300k", "none", disk], capture_output=True
+    ).returncode:
+        pytest.skip("may not mount a disk in memory")
+    try:
+        more = ["logger=wandb", "logger.mode=offline", "total_frames=2400"]
+        assert ended(start(disk / "run", *more, output=tmp_path / "run.txt")) == 1
+        text = (tmp_path / "run.txt").read_text()
+        assert "Traceback" not in text
+        (line,) = (line for line in text.splitlines() if line.startswith("error"))
+        assert "checkpoint.pt: cannot be written (No space left on device)" in line
+        assert load_checkpoint(disk / "run" / "checkpoint.pt")["frames"] >= 24
+    finally:
+        subprocess.run(["umount", "--lazy", disk], check=True)
 
 
 @pytest.mark.parametrize(
@@ -111,9 +134,6 @@ def test_too_few_descriptors(tmp_path: Path):
 
 def test_ctrl_c_while_starting(tmp_path: Path):
     """In the middle of an import: a line, no traceback."""
-    import subprocess
-    import sys
-
     code = "import os, signal, sys\nimport vusfa.cli\nos.kill(os.getpid(), signal.SIGINT)\n"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert (done.returncode, done.stderr) == (-signal.SIGINT, "error: interrupted while starting\n")
