@@ -15,7 +15,8 @@ from sphinx.application import Sphinx
 __all__ = ["include_files", "setup"]
 
 _LINK = re.compile(
-    r"^\[[^\]\n]+\]\((generated/[\w-]+\.md|\.\./[A-Z]+\.md|\.\./examples/[\w/]+\.py)\)$", flags=re.MULTILINE
+    r"^\[[^\]\n]+\]\((generated/[\w-]+\.md|\.\./[A-Z]+\.md|\.\./examples/[\w/]+\.(?:py|yaml))\)$",
+    flags=re.MULTILINE,
 )
 _BESIDE = re.compile(r"\]\(([A-Z]+)\.md\)")
 
@@ -27,8 +28,9 @@ def include_files(app: Sphinx, page: str, source: list[str]) -> None:
         path = Path(app.srcdir, link[1]).resolve()
         app.env.note_dependency(str(path))
         found = path.read_text(encoding="utf-8").replace("](docs/", "](")
-        if link[1].endswith(".py"):
-            return f"```python\n{found}```"
+        language = {".py": "python", ".yaml": "yaml"}.get(path.suffix)
+        if language:
+            return f"```{language}\n{found}```"
         if link[1].startswith("generated/"):
             return f":::{{div}} numbers\n{found}\n:::"
         return _BESIDE.sub(lambda name: f"]({name[1].lower()}.md)", found)

@@ -19,6 +19,7 @@ from vusfa.errors import ResultError, SceneError
 from vusfa.evaluation.exact import exact_goals, expected_walks, sampled_walks, uniform_probabilities
 from vusfa.evaluation.navigation import evaluate
 from vusfa.experiments import training as training_module
+from vusfa.experiments.manifest import read_manifest
 from vusfa.experiments.training import train
 from vusfa.experiments.validation import Validation
 from vusfa.modules import InferencePolicy, TabularPolicy
@@ -155,6 +156,16 @@ def test_validation_goals_are_none_of_the_trained(validation: Validation, made: 
     assert not trained & unseen
     every = Validation(make_trainer(made("env.goals=all")), make_loggers([], "run", {}, run_id="a"))
     assert [int(chosen.sum()) for chosen in every.subsets.values()] == [16, 5]
+
+
+def test_in_the_bundled_rooms_they_are_those_that_choose_the_checkpoints_of_table_1() -> None:
+    overrides = ["agent.hidden_size=8", "agent.embedding_size=8", "autocast=false"]
+    settings: Any = OmegaConf.to_container(compose(overrides=overrides), resolve=True)
+    trainer = make_trainer(settings)
+    validation = Validation(trainer, make_loggers([], "run", {}, run_id="a"))
+    held_out = read_manifest().episodes(trainer.scenes, validation=True)[1].unique()
+    assert torch.equal(validation.goals[validation.subsets["validation"]], held_out)
+    assert torch.equal(validation.goals[validation.subsets["trained"]], trainer.goals.unique())
 
 
 def test_exact_and_sampled_agree(rooms: SceneSet, validation: Validation) -> None:
