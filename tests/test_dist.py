@@ -14,6 +14,7 @@ from types import ModuleType
 
 import pytest
 import yaml
+from PIL import Image
 
 ROOT = Path(__file__).parents[1]
 WHEEL, SOURCE = "vusfa-1.0-py3-none-any.whl", "vusfa-1.0.tar.gz"
@@ -109,6 +110,14 @@ def test_public_ci_runs_what_there_is() -> None:
     scripts = [word for line in commands for word in line.split() if word.startswith(".ci/")]
     assert scripts == [".ci/packages", ".ci/try-wheel"]
     assert all((ROOT / script).stat().st_mode & 0o100 for script in [*scripts, ".ci/check-dist"])
+
+
+def test_the_readme_opens_with_a_film() -> None:
+    with Image.open(ROOT / "docs" / "walk.gif") as film:
+        assert film.n_frames > 10
+    assert (ROOT / "docs" / "walk.gif").stat().st_size < 2_000_000
+    for page in ("README.md", "docs/index.md"):
+        assert "vusfa film vusfa" in (ROOT / page).read_text(encoding="utf-8")
 
 
 def test_one_version_everywhere() -> None:

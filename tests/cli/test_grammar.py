@@ -213,3 +213,27 @@ def test_film_of_what_is_not_there(word: str, fault: str, tmp_path: Path) -> Non
     assert (done.exit_code, done.stderr.count("\n")) == (1, 1), done.output
     assert done.stderr.startswith(f"error: {fault}")
     assert not (tmp_path / "a.gif").exists()
+
+
+@pytest.mark.parametrize(
+    ("command", "word", "fault"),
+    [
+        ("table1", "seed=x", "seed"),
+        ("table1", "agent.modle=gvf", "no setting is called 'agent.modle'"),
+        ("table1", "optim=sgd", "optim=sgd"),
+        ("generalise", "agent.modle=gvf", "no setting is called 'agent.modle'"),
+        ("generalise", "optim=sgd", "optim=sgd"),
+    ],
+)
+def test_a_wrong_setting_of_an_experiment_is_one_line(
+    command: str, word: str, fault: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for number in range(40):
+        (tmp_path / f"room-{number}.h5").symlink_to(bundled_path("bathroom"))
+    monkeypatch.chdir(tmp_path)
+    line = [command, *([str(tmp_path)] if command == "generalise" else []), word]
+    done = CliRunner().invoke(app, line)
+    assert done.exit_code in (1, 2), done.output
+    assert done.stderr.startswith("error: ")
+    assert fault in done.stderr
+    assert done.stderr.count("\n") == 1

@@ -119,6 +119,14 @@ def as_command(function: Callable[..., Any]) -> Callable[..., Any]:
         except KeyboardInterrupt as interrupt:
             typer.echo(f"error: {str(interrupt) or 'interrupted'}", err=True)
             raise typer.Exit(130) from interrupt
+        except Exception as error:  # of Hydra's: a setting among the arguments
+            if type(error).__module__.partition(".")[0] not in ("hydra", "omegaconf"):
+                raise
+            from vusfa.cli.launch import explain
+            from vusfa.conf import FOLDER
+
+            typer.echo(f"error: {explain(error, FOLDER)}", err=True)
+            raise typer.Exit(2) from error
 
     command.__doc__ = text
     command.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]

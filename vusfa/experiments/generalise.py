@@ -73,7 +73,7 @@ def generalise(
 
     Args:
         rooms: folder of dumps (.h5).
-        overrides: settings of recipes/train.py over those of preset=unseen.
+        overrides: settings of vusfa train over those of preset=unseen.
         name: of the results, before the seed.
         seed: of everything.
         trained: rooms to train on.

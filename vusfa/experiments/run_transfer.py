@@ -59,9 +59,7 @@ def run_transfer(
                 trained = read_run(results, source, f"{model}-{seed}").info["checkpoint"]
                 checkpoint = runs / source / f"{model}-{seed}" / trained
                 if not checkpoint.exists():
-                    raise CheckpointError(
-                        f"{checkpoint}: missing; run recipes/table1.py with the same --runs"
-                    )
+                    raise CheckpointError(f"{checkpoint}: missing; run vusfa table1 with the same --runs")
                 _, scenes, state = load_agent(checkpoint)
                 began, curves = time.monotonic(), []
                 for index in track(range(sets), description=name, console=Console(stderr=True)):

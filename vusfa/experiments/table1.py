@@ -61,7 +61,7 @@ def table1(
     "untrained" is VUSFA before its first update. ``vusfa tables`` prints the tables.
 
     Args:
-        overrides: settings of recipes/train.py, such as preset=paper.
+        overrides: settings of vusfa train, such as preset=paper.
         experiment: name of the table.
         models: of the four, and untrained.
         seeds: the same for all models.

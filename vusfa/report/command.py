@@ -43,7 +43,8 @@ def report_runs(
     """Write one self-contained HTML page of runs and results.
 
     Its tables are written beside it as CSV, unrounded, in the folder PAGE_tables. NAME=FOLDER calls a model
-    NAME; runs of one name are seeds of one model, unless their settings differ.
+    NAME, which must not be an option's; runs of one name are seeds of one model, unless their settings
+    differ.
 
     Args:
         sources: folders of runs of vusfa train, of results, of sweeps or of experiments.
@@ -86,6 +87,7 @@ def report_runs(
                     loggers.log_table(name, even(rows), 0)
     for path in paths:
         print(path)
+    print(f"next: open {out} in a browser", file=sys.stderr)
 
 
 def _shown(source: str) -> str:

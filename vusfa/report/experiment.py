@@ -92,7 +92,7 @@ def read_experiment(root: str | Path, names: Sequence[str], scenes: SceneSet | N
     """
     runs = [run for name in names for run in read_runs(root, name) if run.episodes]
     if not runs:
-        raise ResultError(f"{root}: no results of {' or '.join(names)}; run recipes/table1.py first")
+        raise ResultError(f"{root}: no results of {' or '.join(names)}; run vusfa table1 first")
     first = next(iter(runs[0].episodes.values()))
     for run in runs:
         for mode, table in run.episodes.items():

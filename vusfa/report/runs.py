@@ -27,7 +27,7 @@ from vusfa.training.scene_files import find_given
 __all__ = ["LoggedRun", "read_episodes", "read_run", "run_label", "split_name"]
 
 _EVALUATIONS = ("zero_shot", "evaluation")
-_AGAIN = "evaluate the run again with recipes/zero_shot.py"
+_AGAIN = "evaluate the run again with vusfa evaluate"
 #: Types of what a report reads of a run's settings, where they are there.
 _SETTINGS: dict[str, Any] = {
     "agent": dict,
@@ -133,11 +133,11 @@ def read_run(source: str | Path) -> LoggedRun:
     >>> read_run("vusfa=/no/such/folder")
     Traceback (most recent call last):
     ...
-    vusfa.errors.ConfigError: /no/such/folder is not a folder; give the folder of a run of recipes/train.py
+    vusfa.errors.ConfigError: /no/such/folder is not a folder; give the folder of a run of vusfa train
     """
     label, folder = split_name(source)
     if not folder.is_dir():
-        raise ConfigError(f"{folder} is not a folder; give the folder of a run of recipes/train.py")
+        raise ConfigError(f"{folder} is not a folder; give the folder of a run of vusfa train")
     settings, named = _read_settings(folder / "config.json")
     log, checkpoint = folder / "metrics.csv", folder / "checkpoint.pt"
     episodes, references, variant = _evaluation(folder)

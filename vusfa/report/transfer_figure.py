@@ -218,7 +218,7 @@ def show_transfer(
     """
     found = read_runs(results, experiment)
     if not found:
-        raise ResultError(f"{results / experiment}: no results; run recipes/transfer.py run first")
+        raise ResultError(f"{results / experiment}: no results; run vusfa transfer run first")
     world = SceneSet.open(scenes or found[0].info["scenes"])
     print(*transfer_tables(found, world, threshold), sep="\n\n")
     bounds = baseline_lengths(found, world)
