@@ -306,3 +306,57 @@ def test_files_whose_scenes_are_called_alike_are_called_by_their_files_names(
     assert SceneSet.open([paths[0]]).names == (alone,)
     with pytest.raises(SceneError, match="2 scenes are called 'room-1'"):
         SceneSet.open([paths[0], paths[0]])
+
+
+def test_a_folder_and_a_pattern_stand_for_their_files(
+    tmp_path: Path, make_scene: Callable[..., Scene]
+) -> None:
+    folder = tmp_path / "rooms"
+    folder.mkdir()
+    for name in ("b_small", "a_small", "c"):
+        make_scene(name).save(folder / f"{name}.h5")
+    (folder / "notes.txt").write_text("no scene")
+    opened = SceneSet.open(folder)
+    assert opened.names == ("a_small", "b_small", "c")
+    assert opened.sources == tuple(str(folder / f"{name}.h5") for name in opened.names)
+    assert SceneSet.open(["bathroom", "kitchen"]).sources == ("bathroom", "kitchen")
+    assert SceneSet.open([f"{folder}/*_small.h5", str(folder / "c.h5")]).names == opened.names
+    (tmp_path / "none").mkdir()
+    for nothing in (tmp_path / "none", f"{folder}/*_large.h5"):
+        with pytest.raises(SceneError, match="there are no scene files"):
+            SceneSet.open(nothing)
+
+
+def test_a_broken_file_is_named_and_can_be_left_out(tmp_path: Path, make_scene: Callable[..., Scene]) -> None:
+    for name in ("a", "b", "c"):
+        make_scene(name).save(tmp_path / f"{name}.h5")
+    (tmp_path / "b.h5").write_bytes((tmp_path / "b.h5").read_bytes()[:1000])
+    with pytest.raises(SceneError, match=r"b\.h5: cannot be read as HDF5"):
+        SceneSet.open(tmp_path)
+    with pytest.warns(UserWarning, match=r"1 scenes cannot be opened and are left out:\n  - .*b\.h5"):
+        assert SceneSet.open(tmp_path, skip_broken=True).names == ("a", "c")
+    for name in ("a", "c"):
+        (tmp_path / f"{name}.h5").write_bytes(b"")
+    with pytest.warns(UserWarning, match="3 scenes"), pytest.raises(SceneError, match="at least one scene"):
+        SceneSet.open(tmp_path, skip_broken=True)
+
+
+def test_scenes_that_differ_are_named_with_their_files(
+    tmp_path: Path, make_scene: Callable[..., Scene]
+) -> None:
+    make_scene("a").save(tmp_path / "a.h5")
+    make_scene("b", features=9).save(tmp_path / "b.h5")
+    with pytest.raises(SceneError, match=r"'a' \(.*a\.h5\) and 'b' \(.*b\.h5\) differ in feature size"):
+        SceneSet.open(tmp_path)
+
+
+def test_a_set_and_its_scenes_share_one_copy_of_the_features(make_scene: Callable[..., Scene]) -> None:
+    one, other = make_scene("a"), make_scene("b", width=3)
+    values = other.features.clone()
+    both = SceneSet([one, other])
+    assert other.features.data_ptr() == both.features[one.num_states :].data_ptr()
+    assert torch.equal(other.features, values)
+    for again in (copy.deepcopy(other), pickle.loads(pickle.dumps(other))):
+        assert torch.equal(again.features, values)
+        assert again.features.untyped_storage().nbytes() == values.untyped_storage().nbytes()
+    assert torch.equal(pickle.loads(pickle.dumps(both)).features, both.features)

@@ -90,3 +90,19 @@ def test_meters_go_on_from_their_state(rooms: SceneSet):
     again.load_state_dict(means.state_dict())
     again.update({"b": torch.tensor(2), "a": torch.tensor(2.0)})
     assert again.flush() == {"a": 1.5, "b": 3.0}
+
+
+def test_of_many_scenes_and_goals_the_log_has_quantiles(rooms: SceneSet, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr("vusfa.training.metrics.MAX_SCENES", 1)
+    monkeypatch.setattr("vusfa.training.metrics.MAX_GOALS", 2)
+    meter = EpisodeMeter(rooms, torch.tensor([3, 5, 20]))
+    assert math.isnan(meter.flush()["goals/success_p50"])
+    sums = torch.zeros(5, 3, dtype=torch.float64)
+    sums[:2] = torch.tensor([[4.0, 0.0, 10.0], [1.0, 0.0, 5.0]])  # episodes and successes
+    meter.load_state_dict({"sums": sums, "frames": torch.tensor(1), "collisions": torch.tensor(0)})
+    line = meter.flush()
+    assert (line["scenes/seen"], line["goals/seen"]) == (2, 2)
+    assert line["goals/success_p50"] == pytest.approx(0.375)
+    assert line["scenes/success_p90"] == pytest.approx(0.475)
+    assert line["success"] == pytest.approx(6 / 14)
+    assert not any(key.startswith(("goal/", "scene/")) for key in line)

@@ -227,6 +227,7 @@ class Settings:
     resume: str | None
     overwrite: bool
     by_model: dict[str, Any] = field(default_factory=dict)
+    skip_broken_scenes: bool = False
 
 
 def flat(settings: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:

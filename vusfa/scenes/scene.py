@@ -30,8 +30,7 @@ __all__ = ["Scene"]
 
 
 class _Distance:
-    """The field ``Scene.distance``: what was given until it is checked, then a table that is made when asked
-    for."""
+    """The field ``Scene.distance``: what was given, until it is checked; then a table made on request."""
 
     def __get__(self, scene: Scene | None, owner: type) -> Any:
         return None if scene is None else scene._paths.table
@@ -242,8 +241,7 @@ class Scene:
 
     def all_distances(self) -> Iterator[Tensor]:
         """:meth:`distances_to` all states, some (G, N) at a time."""
-        at_once = max(1, (1 << 22) // self.num_states)
-        return (self.distances_to(goals) for goals in torch.arange(self.num_states).split(at_once))
+        return map(self.distances_to, torch.arange(self.num_states).split((1 << 22) // self.num_states))
 
     @cached_property
     def longest_path(self) -> int:
@@ -253,6 +251,12 @@ class Scene:
     def path_lengths(self, state: Tensor, goal: Tensor) -> Tensor:
         """Lengths (n,) int64 of the shortest paths from states (n,) to goals (n,); -1: there is none."""
         return self._paths.between(state, goal)
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**vars(self), "features": self.features.numpy()}  # not the table of a set that it is part of
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        vars(self).update(state, features=torch.from_numpy(state["features"]))
 
     def __repr__(self) -> str:
         return f"Scene({self.name!r}, {self.num_states} states, {self.num_actions} actions)"

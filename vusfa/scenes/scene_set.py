@@ -8,7 +8,6 @@ from __future__ import annotations
 import hashlib
 import os
 from collections.abc import Iterable, Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,6 +16,7 @@ from torch import Tensor
 
 from vusfa.errors import SceneError
 from vusfa.scenes.graph import successor_table
+from vusfa.scenes.places import listed, open_scenes
 from vusfa.scenes.scene import Scene
 from vusfa.scenes.store import bundled_names
 from vusfa.scenes.validation import check_alike
@@ -39,6 +39,7 @@ class SceneSet:
         scene_id: (S,) int64, index of the scene.
         location: (S, 2) float32, metres, each scene in its own frame.
         rotation: (S,) float32, degrees.
+        sources: names and paths that :meth:`open` has opened.
 
     Raises:
         SceneError: no scenes, two of one name, or scenes that differ in actions, crops or feature size.
@@ -49,6 +50,8 @@ class SceneSet:
     >>> rooms.distance(torch.tensor([0, 0]), torch.tensor([0, 176])).tolist()  # itself; another room
     [0, -1]
     """
+
+    sources: tuple[str, ...] = ()
 
     def __init__(self, scenes: Iterable[Scene]) -> None:
         self.scenes: tuple[Scene, ...] = tuple(scenes)
@@ -69,6 +72,8 @@ class SceneSet:
         self.successor = _joined([t.numpy() + n for (t, _), n in zip(tables, offsets[:-1], strict=True)])
         self.blocked = _joined([blocked.numpy() for _, blocked in tables])
         self.features = _joined([scene.features.numpy() for scene in self.scenes])
+        for scene, first, end in zip(self.scenes, offsets[:-1], offsets[1:], strict=True):
+            object.__setattr__(scene, "features", self.features[first:end])  # one copy, not two
         self.location = _joined([scene.location.numpy() for scene in self.scenes])
         self.rotation = _joined([scene.rotation.numpy() for scene in self.scenes])
         self.scene_id = torch.from_numpy(np.repeat(np.arange(len(sizes)), sizes))
@@ -80,13 +85,19 @@ class SceneSet:
         >>> SceneSet.bundled().names
         ('bathroom', 'bedroom', 'kitchen', 'living_room')
         """
-        return cls(Scene.bundled(name) for name in (bundled_names() if names is None else _listed(names)))
+        return cls(Scene.bundled(name) for name in (bundled_names() if names is None else listed(names)))
 
     @classmethod
-    def open(cls, scenes: str | os.PathLike[str] | Sequence[str | os.PathLike[str]]) -> SceneSet:
+    def open(
+        cls, scenes: str | os.PathLike[str] | Sequence[str | os.PathLike[str]], skip_broken: bool = False
+    ) -> SceneSet:
         """Open bundled names and files alike: ``SceneSet.open(["bathroom", "my_room.h5"])``.
 
         Scenes of one name, such as rooms of one kind from several seeds, are renamed after their files.
+
+        Args:
+            scenes: names, files, folders of scene files (``rooms/``) and patterns (``rooms/*_small.h5``).
+            skip_broken: leave files with faults out, with a warning that names them.
 
         Raises:
             SceneError: neither a bundled name nor a file, or a file with faults.
@@ -94,13 +105,10 @@ class SceneSet:
         >>> SceneSet.open("kitchen").num_states
         680
         """
-        sources = _listed(scenes)
-        opened = [Scene.open(source) for source in sources]
-        names = [scene.name for scene in opened]
-        for source, scene in zip(sources, opened, strict=True):
-            if names.count(scene.name) > 1 and Path(source).suffix:
-                object.__setattr__(scene, "name", Path(source).stem)  # nobody else holds it yet
-        return cls(opened)
+        sources, opened = open_scenes(scenes, skip_broken)
+        found = cls(opened)
+        found.sources = tuple(sources)
+        return found
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -286,7 +294,3 @@ class SceneSet:
 def _joined(arrays: list[np.ndarray]) -> Tensor:
     """All arrays in one; a single one is shared, not copied."""
     return torch.from_numpy(np.concatenate(arrays) if len(arrays) > 1 else arrays[0])
-
-
-def _listed(scenes: Any) -> list[Any]:
-    return [scenes] if isinstance(scenes, str | os.PathLike) else list(scenes)

@@ -8,6 +8,7 @@ many there are, and the mend. Islands (states that some others cannot reach) are
 from __future__ import annotations
 
 import os
+from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
 from typing import TYPE_CHECKING
 
@@ -240,12 +241,9 @@ def check_alike(scenes: Sequence[Scene]) -> None:
     Raises:
         SceneError: two of one name, or scenes that differ in actions, crops or feature size.
     """
-    names = [scene.name for scene in scenes]
-    for name in names:
-        if names.count(name) > 1:
-            raise SceneError(
-                f"{names.count(name)} scenes are called {name!r}; rename all but one (attribute 'scene')"
-            )
+    name, times = Counter(scene.name for scene in scenes).most_common(1)[0]
+    if times > 1:
+        raise SceneError(f"{times} scenes are called {name!r}; rename all but one (attribute 'scene')")
     first = scenes[0]
     for scene in scenes[1:]:
         for what, of_first, of_this in (
@@ -254,7 +252,11 @@ def check_alike(scenes: Sequence[Scene]) -> None:
             ("feature size", first.feature_size, scene.feature_size),
         ):
             if of_first != of_this:
+                one, other = (
+                    repr(room.name) if room.path is None else f"{room.name!r} ({room.path})"
+                    for room in (first, scene)
+                )
                 raise SceneError(
-                    f"scenes {first.name!r} and {scene.name!r} differ in {what} ({of_first}, {of_this});"
+                    f"scenes {one} and {other} differ in {what} ({of_first}, {of_this});"
                     f" put them in different sets"
                 )

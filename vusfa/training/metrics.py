@@ -20,6 +20,9 @@ __all__ = ["EpisodeMeter", "MeanMeter"]
 
 # The table of sums has five rows: episodes, successes, length, length of the successes, their shortest paths.
 _EPISODES = 0
+#: Scenes and goals up to which each has columns of its own in the log.
+MAX_SCENES, MAX_GOALS = 100, 1000
+_QUANTILES = (0.1, 0.5, 0.9)
 
 
 class EpisodeMeter:
@@ -79,8 +82,10 @@ class EpisodeMeter:
             ``episodes`` and ``collisions`` (per step); ``success`` (share of the episodes that ended at their
             goal), ``length`` (of an episode, in actions) and ``length_ratio`` (mean length of the successful
             episodes over the mean of their shortest paths) over all goals; the same under ``scene/NAME/``
-            and, without the length, under ``goal/NAME/STATE/``. A rate over no episode is NaN. The keys are
-            always the same.
+            and, without the length, under ``goal/NAME/STATE/``. With more than :data:`MAX_SCENES` scenes or
+            :data:`MAX_GOALS` goals: instead of these, how many of them had an episode (``scenes/seen``),
+            and quantiles of their success (``scenes/success_p10``, ``_p50``, ``_p90``; ``goals/...``). A
+            rate over no episode is NaN. The keys are always the same.
         """
         sums = self._sums
         collisions = self._collisions.item() / self._frames if self._frames else math.nan
@@ -89,14 +94,19 @@ class EpisodeMeter:
             "collisions": collisions,
             **_rates(sums.sum(1).tolist()),
         }
-        for index, name in enumerate(self._scene_names):
-            chosen = self._scene == index
-            if bool(chosen.any()):
-                rates = _rates(sums[:, chosen].sum(1).tolist())
-                result |= {f"scene/{name}/{key}": value for key, value in rates.items()}
-        for name, column in zip(self._names, sums.T.tolist(), strict=True):
-            rates = _rates(column)
-            result |= {f"goal/{name}/{key}": rates[key] for key in ("success", "length_ratio")}
+        by_scene = sums.new_zeros(5, len(self._scene_names)).index_add_(1, self._scene, sums)
+        if len(self._scene_names) > MAX_SCENES:
+            result |= _spread("scenes", by_scene)
+        else:
+            for index in self._scene.unique().tolist():
+                rates = _rates(by_scene[:, index].tolist())
+                result |= {f"scene/{self._scene_names[index]}/{key}": rate for key, rate in rates.items()}
+        if len(self._names) > MAX_GOALS:
+            result |= _spread("goals", sums)
+        else:
+            for name, column in zip(self._names, sums.T.tolist(), strict=True):
+                rates = _rates(column)
+                result |= {f"goal/{name}/{key}": rates[key] for key in ("success", "length_ratio")}
         self._clear()
         return result
 
@@ -156,6 +166,17 @@ class MeanMeter:
         if not fits or type(count) is not int or not all(isinstance(name, str) for name in names):
             raise ValueError(f"{len(names)} names, {count} updates and sums that do not fit them")
         self._names, self._sum, self._count = names, total, count
+
+
+def _spread(name: str, sums: Tensor) -> dict[str, float]:
+    """Of the columns of a table of sums that have episodes: their number, and quantiles of their success."""
+    seen = sums[:, sums[_EPISODES] > 0]
+    quantiles = (seen[1] / seen[_EPISODES]).quantile(seen.new_tensor(_QUANTILES)) if seen.numel() else None
+    found = [math.nan] * len(_QUANTILES) if quantiles is None else quantiles.tolist()
+    return {
+        f"{name}/seen": float(seen.shape[1]),
+        **{f"{name}/success_p{100 * q:.0f}": value for q, value in zip(_QUANTILES, found, strict=True)},
+    }
 
 
 def _rates(sums: Sequence[float]) -> dict[str, float]:

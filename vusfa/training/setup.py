@@ -47,7 +47,9 @@ def make_trainer(
     device, optim = usable_device(settings["device"]), settings["optim"]
     if not isinstance(settings["autocast"], bool):
         settings = {**settings, "autocast": decide_autocast(settings)}
-    scenes = SceneSet.open(settings["scenes"]) if scenes is None else scenes
+    if scenes is None:
+        scenes = SceneSet.open(settings["scenes"], settings.get("skip_broken_scenes", False))
+        settings = {**settings, "scenes": list(scenes.sources)}  # what a folder or a pattern stood for
     goals = resolve_goals(scenes, settings["env"]["goals"])
     task = {**settings["env"], "goals": goals}
     rotation = make_rotation(task, settings["seed"])

@@ -1,0 +1,71 @@
+"""Where scenes are: bundled names, files, folders of files, and patterns."""
+
+from __future__ import annotations
+
+import os
+import warnings
+from collections import Counter
+from collections.abc import Sequence
+from glob import glob
+from pathlib import Path
+from typing import Any
+
+from vusfa.errors import SceneError
+from vusfa.limits import MAX_FAULTS
+from vusfa.scenes.scene import Scene
+
+__all__ = ["expanded", "listed", "open_scenes"]
+
+_SUFFIXES = (".h5", ".hdf5")
+
+
+def expanded(scenes: str | os.PathLike[str] | Sequence[str | os.PathLike[str]]) -> list[Any]:
+    """Names and files, in order: a folder (``rooms/``) stands for its files ``*.h5`` and ``*.hdf5``, and a
+    pattern (``rooms/*_small.h5``) for the files that match it, both by name.
+
+    Raises:
+        SceneError: a folder without scene files, or a pattern that no file matches.
+
+    >>> expanded(["bathroom", "my_room.h5"])
+    ['bathroom', 'my_room.h5']
+    """
+    found: list[Any] = []
+    for source in listed(scenes):
+        text = os.fspath(source)
+        if os.path.isdir(text):
+            inside = sorted(entry.path for entry in os.scandir(text) if Path(entry.name).suffix in _SUFFIXES)
+        elif any(sign in text for sign in "*?[") and not os.path.lexists(text):
+            inside = sorted(glob(text, recursive=True))
+        else:
+            inside = [source]
+        if not inside:
+            raise SceneError(f"{text}: there are no scene files ({', '.join(_SUFFIXES)}); check the path")
+        found += inside
+    return found
+
+
+def open_scenes(scenes: Any, skip_broken: bool = False) -> tuple[list[str], list[Scene]]:
+    """Names and paths, expanded, and their scenes; arguments and errors of
+    :meth:`vusfa.scenes.SceneSet.open`."""
+    sources, opened, faults = [], [], []
+    for source in expanded(scenes):
+        try:
+            opened.append(Scene.open(source))
+            sources.append(os.fspath(source))
+        except SceneError as error:
+            if not skip_broken:
+                raise
+            faults.append(error)
+    if faults:
+        listing = "".join(f"\n  - {fault}" for fault in faults[:MAX_FAULTS])
+        warnings.warn(f"{len(faults)} scenes cannot be opened and are left out:{listing}", stacklevel=3)
+    times = Counter(scene.name for scene in opened)
+    for source, scene in zip(sources, opened, strict=True):
+        if times[scene.name] > 1 and Path(source).suffix:
+            object.__setattr__(scene, "name", Path(source).stem)  # nobody else holds it yet
+    return sources, opened
+
+
+def listed(scenes: Any) -> list[Any]:
+    """One name or path, or several, as a list."""
+    return [scenes] if isinstance(scenes, str | os.PathLike) else list(scenes)
