@@ -94,13 +94,14 @@ def test_only_lent_heads_are_stepped_and_all_come_back(five: SceneSet, make: Any
         ["env.goal_sampling=fixed"],
         ["env.goal_sampling=episode"],
         ["algorithm=hindsight", "hindsight.batch_size=16", "hindsight.updates=2", "hindsight.capacity=200"],
+        ["algorithm=replay_search", "algorithm.learning_starts=24", "algorithm.batch_size=64"],
         ["preset=autoencoder", "agent.history=1", "collector.num_envs=6", "collector.rollout=4"],
         ["agent.history=2", "agent.shared_heads=true"],
         ["agent.memory=lstm"],
         ["optim=rmsprop"],
         ["collector.num_envs=12", "optim=a3c", "optim.options.threads_per_update=6"],
     ],
-    ids=["fixed", "episode", "hindsight", "autoencoder", "shared", "lstm", "rmsprop", "a3c"],
+    ids=["fixed", "episode", "hindsight", "search", "autoencoder", "shared", "lstm", "rmsprop", "a3c"],
 )
 def test_a_resumed_training_goes_on_number_for_number(
     made: Callable[..., Trainer], tmp_path: Path, extra: list[str]

@@ -106,6 +106,10 @@ class ReplaySearch(USF):
         self.replay_steps = self._numbers["updates"] - 1 if begun else 0
         self._searches = begun
 
+    def scenes_on_record(self) -> Tensor:
+        """Those of the graph."""
+        return self.graph.scene_of[self.graph.scene_of >= 0].unique()
+
     def losses(self, batch: TensorDictBase) -> dict[str, Tensor]:
         """On-policy terms, and those of pairs from a graph that has the batch."""
         terms = super().losses(batch)
