@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import os
 import socket
 import sys
 import threading
@@ -20,7 +21,9 @@ from PIL import Image
 from vusfa import limits
 from vusfa.deploy import cameras
 from vusfa.deploy.cameras import open_camera
+from vusfa.deploy.pictures import as_picture
 from vusfa.errors import CameraError, SceneError
+from vusfa.sources.photos import fit_picture
 
 
 def jpeg(level: int) -> bytes:
@@ -197,3 +200,21 @@ def test_opencvs_pictures_are_turned_to_rgb_until_they_end(
     monkeypatch.setitem(sys.modules, "cv2", None)
     with pytest.raises(CameraError, match="need OpenCV: pip install opencv-python-headless"):
         open_camera("0")
+
+
+@pytest.mark.parametrize("kind", ["pipe", "device", "folder"])
+def test_goals_and_pictures_of_a_folder_are_regular_files(tmp_path: Path, kind: str) -> None:
+    """A pipe would be waited for, a device never ends."""
+    place = tmp_path / "a.jpg"
+    if kind == "pipe":
+        os.mkfifo(place)
+    elif kind == "device":
+        place.symlink_to("/dev/zero")
+    else:
+        place.mkdir()
+    with pytest.raises(SceneError, match=r"a\.jpg: cannot be read \(it is no regular file\)"):
+        as_picture(place)
+    with pytest.raises(SceneError, match=r"a\.jpg: cannot be read \(it is no regular file\)"):
+        next(open_camera(str(tmp_path)))
+    with pytest.raises(OSError, match="it is no regular file"):
+        fit_picture(place, 8, 8)

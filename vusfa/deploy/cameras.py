@@ -18,7 +18,7 @@ from urllib.request import OpenerDirector, ProxyHandler, build_opener
 import numpy as np
 
 from vusfa import limits
-from vusfa.deploy.pictures import decode_upright
+from vusfa.deploy.pictures import decode_upright, read_upright
 from vusfa.errors import CameraError
 from vusfa.limits import brief
 
@@ -73,7 +73,7 @@ def _folder(path: Path) -> Iterator[np.ndarray]:
     files.sort(
         key=lambda file: [int(part) if part.isdecimal() else part for part in re.split(r"(\d+)", file.name)]
     )
-    return (decode_upright(file.read_bytes(), str(file)) for file in files)
+    return (read_upright(file) for file in files)
 
 
 def _opencv(source: int | str, name: str) -> Iterator[np.ndarray]:

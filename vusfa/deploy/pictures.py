@@ -5,7 +5,6 @@ from __future__ import annotations
 import io
 import os
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,6 +13,7 @@ from torch import Tensor
 
 from vusfa import limits
 from vusfa.errors import SceneError
+from vusfa.reading import open_regular
 from vusfa.scenes.pictures import check_scans, open_image
 
 __all__ = ["MIN_PICTURE_SIDE", "as_picture", "decode_upright", "in_shape"]
@@ -55,6 +55,16 @@ def decode_upright(encoded: bytes, name: str) -> np.ndarray:
         ) from error
 
 
+def read_upright(path: str | os.PathLike[str]) -> np.ndarray:
+    """:func:`decode_upright` of a regular file, which a pipe or a device is not."""
+    try:
+        with open_regular(path) as file:
+            encoded = file.read()
+    except OSError as error:
+        raise SceneError(f"{path}: cannot be read ({error.strerror or error}); check the path") from error
+    return decode_upright(encoded, os.fspath(path))
+
+
 def as_picture(picture: Any) -> tuple[np.ndarray, str]:
     """Any picture as (H, W, 3) uint8, and what messages call it.
 
@@ -73,10 +83,7 @@ def as_picture(picture: Any) -> tuple[np.ndarray, str]:
     name = "the picture"
     if isinstance(picture, str | os.PathLike):
         name = os.fspath(picture)
-        try:
-            array = decode_upright(Path(picture).read_bytes(), name)
-        except OSError as error:
-            raise SceneError(f"{name}: cannot be read ({error.strerror or error}); check the path") from error
+        array = read_upright(picture)
     elif isinstance(picture, Image.Image):
         array = np.asarray(picture.convert("RGB"))
     else:

@@ -17,7 +17,7 @@ from PIL import Image, ImageOps
 
 from vusfa.errors import SceneError
 from vusfa.limits import MAX_PHOTO_PIXELS
-from vusfa.reading import read_npy
+from vusfa.reading import open_regular, read_npy
 from vusfa.scenes.graph import default_actions
 from vusfa.scenes.pictures import open_image, to_jpeg
 from vusfa.scenes.validation import raise_faults
@@ -145,7 +145,7 @@ def fit_picture(path: str | os.PathLike[str], width: int, height: int) -> np.nda
     Raises:
         OSError: it is no picture that can be read.
     """
-    with open_image(path) as image:
+    with open_regular(path) as file, open_image(file) as image:
         # JPEG files of cameras are large: they can be decoded at half their size, a quarter, ...
         image.draft("RGB", (4 * max(width, height),) * 2)
         if image.width * image.height > MAX_PHOTO_PIXELS:
