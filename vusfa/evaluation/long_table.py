@@ -242,12 +242,21 @@ def goal_sums(tables: Sequence[pd.DataFrame], metric: str) -> tuple[Sums, Tensor
         sums (K, G) and the number (G,) of each goal's scene; None where there are no goals, or the seeds have
         different ones.
     """
-    parts = [table[table.metric == metric].sort_values(["scene", "goal"]) for table in tables]
-    goals = [list(zip(part.scene, part.goal, strict=True)) for part in parts]
-    if not parts or not goals[0] or any(other != goals[0] for other in goals[1:]):
+    parts = [_by_goal(table, metric) for table in tables]
+    if not parts or not len(parts[0][0]):
         return None
-    over, under = (torch.tensor(np.stack([part[name] for part in parts])) for name in _SUMMED)
-    return Sums(over, under), torch.tensor(pd.factorize(parts[0].scene.astype(object))[0])
+    scenes, goals, over, under = zip(*parts, strict=True)
+    if not all(np.array_equal(other, of[0]) for of in (goals, scenes) for other in of[1:]):
+        return None
+    sums = Sums(torch.tensor(np.stack(over)), torch.tensor(np.stack(under)))
+    return sums, torch.tensor(pd.factorize(scenes[0])[0])
+
+
+def _by_goal(table: pd.DataFrame, metric: str) -> list[np.ndarray]:
+    """Scenes, goals, numerators and denominators of a metric, sorted by scene and goal."""
+    rows = np.flatnonzero(table.metric == metric)
+    rows = rows[np.lexsort((table.goal.to_numpy()[rows], table.scene.cat.codes.to_numpy()[rows]))]
+    return [table[name].array[rows].to_numpy() for name in ("scene", "goal", *_SUMMED)]
 
 
 def distance_to_trained(scenes: SceneSet, scene: Tensor, goal: Tensor, trained: Tensor) -> Tensor:

@@ -24,7 +24,7 @@ from vusfa.report.packing import pack
 from vusfa.report.pictures import thumbnails
 from vusfa.report.run_scenes import open_scenes
 from vusfa.report.runs import LoggedRun
-from vusfa.report.tables import reference_rows, run_rows, seed_rows, summary_rows
+from vusfa.report.tables import baseline_rows, run_rows, seed_rows, summary_rows
 from vusfa.scenes import Scene, SceneSet
 from vusfa.training.checkpoint import load_checkpoint, saved_agent
 
@@ -75,12 +75,12 @@ def tables(runs: Sequence[LoggedRun], scenes: Mapping[str, Scene], options: Opti
         options: for ``within``.
     """
     world = SceneSet(scenes.values())
-    beside: list[Row] = []
-    if not any(run.references for run in runs):
-        beside = [row for run in runs if run.episodes for row in reference_rows(run, world, options.within)]
+    measured = any(run.references for run in runs)
+    beside = [] if measured else baseline_rows(runs, world, options.within)
+    seeds = seed_rows(runs, options.within)
     return {
-        "summary": summary_rows(runs, options.within, beside),
-        "seeds": seed_rows(runs, options.within),
+        "summary": summary_rows(runs, options.within, beside, seeds),
+        "seeds": seeds,
         "distance": distance_rows(runs, world, options.within),
         "goals": goal_rows(runs, options.within),
         "runs": run_rows(runs),

@@ -7,11 +7,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from functools import lru_cache
 
 import pandas as pd
+import torch
 
 from vusfa.evaluation.long_table import MEAN_OF_SCENES, goal_sums
-from vusfa.evaluation.statistics import bootstrap_mean
+from vusfa.evaluation.statistics import Draws, bootstrap_mean, make_draws
 
 __all__ = ["intervals"]
 
@@ -32,6 +34,14 @@ def intervals(tables: Sequence[pd.DataFrame], scene: str, names: Sequence[str]) 
         sums = goal_sums(chosen, name)
         low, high = math.nan, math.nan
         if sums is not None:
-            _, low, high = bootstrap_mean(*sums, by_scene=scene == MEAN_OF_SCENES)
+            seeds = len(sums[0].numerator)
+            draws = _draws(seeds, tuple(sums[1].tolist()))
+            _, low, high = bootstrap_mean(*sums, by_scene=scene == MEAN_OF_SCENES, draws=draws)
         result |= {f"{name}_from": low, f"{name}_to": high}
     return result
+
+
+@lru_cache(maxsize=4)
+def _draws(seeds: int, scene: tuple[int, ...]) -> Draws:
+    """Kept, because every metric of every model has the same ones."""
+    return make_draws(seeds, torch.tensor(scene))

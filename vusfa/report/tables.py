@@ -19,6 +19,7 @@ from vusfa.report.runs import LoggedRun
 from vusfa.scenes import SceneSet
 
 __all__ = [
+    "baseline_rows",
     "long_table",
     "over_seeds",
     "reference_rows",
@@ -69,7 +70,10 @@ def seed_rows(runs: Sequence[LoggedRun], within: Sequence[int] = WITHIN) -> list
 
 
 def summary_rows(
-    runs: Sequence[LoggedRun], within: Sequence[int] = WITHIN, beside: Sequence[Mapping[str, Any]] = ()
+    runs: Sequence[LoggedRun],
+    within: Sequence[int] = WITHIN,
+    beside: Sequence[Mapping[str, Any]] = (),
+    seeds: Sequence[Row] | None = None,
 ) -> list[Row]:
     """One row per model, subset of goals and scene; then those of the baselines.
 
@@ -77,13 +81,14 @@ def summary_rows(
         runs: those without an evaluation are left out.
         within: limits of actions to report success for.
         beside: rows of baselines; those of the runs' own evaluations are added.
+        seeds: rows of :func:`seed_rows`, if they are known.
 
     Returns:
         rows with model, kind ("model" or "reference"), goals, scene, seeds, num_goals and num_episodes (of
         one seed), and of every metric the mean, ``_low`` and ``_high`` over the seeds, and the ends ``_from``
         and ``_to`` of its 95 % interval, see :mod:`vusfa.report.intervals`.
     """
-    single = seed_rows(runs, within)
+    single = seed_rows(runs, within) if seeds is None else seeds
     names = metric_columns(single)
     groups: dict[tuple[str, str, str], list[Row]] = {}
     for row in single:
@@ -108,6 +113,28 @@ def summary_rows(
         head = {"model": policy, "kind": "reference", "goals": goals, "scene": scene, "seeds": math.nan}
         counts = {key: row.get(key, math.nan) for key in ("num_goals", "num_episodes")}
         rows.append(head | counts | over_seeds([row], names))
+    return rows
+
+
+def baseline_rows(
+    runs: Sequence[LoggedRun], scenes: SceneSet, within: Sequence[int] = WITHIN
+) -> list[Row]:
+    """:func:`reference_rows` of the first run with each set of goals, scene by scene.
+
+    Args:
+        runs: those without an evaluation are left out.
+        scenes, within: see :func:`reference_rows`.
+    """
+    rows: list[Row] = []
+    covered: set[tuple[str, bool]] = set()
+    for run in runs:
+        if run.episodes is None:
+            continue
+        names = run.episodes.scene_names
+        kinds = {(name, bool(kind)) for name in names for kind in run.episodes.trained.unique()}
+        if not kinds <= covered:
+            covered |= kinds
+            rows += reference_rows(run, scenes, within)
     return rows
 
 
