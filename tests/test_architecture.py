@@ -34,9 +34,9 @@ for _room, _beneath in {
     "training": "algorithms",
     "evaluation": "modules",
     "experiments": "training evaluation",
-    "report": "experiments",
     "deploy": "experiments sources",
-    "cli": "report deploy",
+    "report": "deploy",
+    "cli": "report",
 }.items():
     _direct = set(_beneath.split())
     MAY_IMPORT[_room] = _direct.union({"errors", "deprecated"}, *(MAY_IMPORT[name] for name in _direct))

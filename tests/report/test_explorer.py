@@ -13,7 +13,7 @@ from vusfa.modules import make_agent
 from vusfa.report.explorer import (
     choose_goals,
     choose_starts,
-    principal_components,
+    principal_axes,
     sampled_walks,
     state_maps,
 )
@@ -74,14 +74,29 @@ def test_components_tell_the_distances_of_psi(halls: SceneSet):
     assert maps.explained.tolist() == sorted(maps.explained.tolist(), reverse=True)
 
 
-def test_components_against_singular_values():
+def test_axes_against_singular_values():
     values = torch.randn(50, 5, generator=torch.Generator().manual_seed(0)) * torch.tensor([5.0, 3, 1, 1, 1])
-    found, share = principal_components(values, 2)
-    u, s, _ = torch.linalg.svd(values - values.mean(0), full_matrices=False)
-    assert torch.allclose(found.abs(), (u * s)[:, :2].abs(), atol=1e-4)
-    assert torch.allclose(share, (s**2 / (s**2).sum())[:2], atol=1e-5)
+    mean, directions, share = principal_axes(values, 2)
+    found = (values.double() - mean) @ directions
+    u, s, _ = torch.linalg.svd(values.double() - mean, full_matrices=False)
+    assert torch.allclose(found.abs(), (u * s)[:, :2].abs(), atol=1e-6)
+    assert torch.allclose(share.double(), (s**2 / (s**2).sum())[:2], atol=1e-5)
     assert (found.gather(0, found.abs().argmax(0, keepdim=True)) > 0).all()
-    assert principal_components(torch.ones(4, 3), 1)[1].tolist() == [0.0]
+    assert principal_axes(torch.ones(4, 3), 1)[2].tolist() == [0.0]
+
+
+def test_axes_of_a_part_show_all_pairs(halls: SceneSet, monkeypatch: pytest.MonkeyPatch):
+    agent, goals = agent_of(halls, "usfa", history=1), list(range(24))
+    whole = state_maps(agent, halls, 1, goals)
+    monkeypatch.setattr("vusfa.report.explorer._PAIRS_FOR_AXES", 100)
+    monkeypatch.setattr("vusfa.report.explorer._ROWS", 50)
+    part = state_maps(agent, halls, 1, goals)
+    assert torch.allclose(part.value, whole.value, atol=1e-5)
+    assert torch.allclose(part.probabilities, whole.probabilities, atol=1e-5)
+    assert part.components is not None
+    assert whole.components is not None
+    for one, other in zip(part.components.unbind(-1), whole.components.unbind(-1), strict=True):
+        assert torch.corrcoef(torch.stack([one.flatten(), other.flatten()]))[0, 1].abs() > 0.9
 
 
 @pytest.mark.parametrize(

@@ -242,21 +242,16 @@ def goal_sums(tables: Sequence[pd.DataFrame], metric: str) -> tuple[Sums, Tensor
         sums (K, G) and the number (G,) of each goal's scene; None where there are no goals, or the seeds have
         different ones.
     """
-    parts = [_by_goal(table, metric) for table in tables]
-    if not parts or not len(parts[0][0]):
-        return None
-    scenes, goals, over, under = zip(*parts, strict=True)
-    if not all(np.array_equal(other, of[0]) for of in (goals, scenes) for other in of[1:]):
+    parts = []
+    for table in tables:
+        rows = np.flatnonzero(table.metric == metric)
+        rows = rows[np.lexsort((table.goal.to_numpy()[rows], table.scene.cat.codes.to_numpy()[rows]))]
+        parts.append([table[name].array[rows].to_numpy() for name in ("scene", "goal", *_SUMMED)])
+    scenes, goals, over, under = zip(*parts, strict=True) if parts else ([()],) * 4
+    if not len(scenes[0]) or any(not np.array_equal(x, of[0]) for of in (goals, scenes) for x in of):
         return None
     sums = Sums(torch.tensor(np.stack(over)), torch.tensor(np.stack(under)))
     return sums, torch.tensor(pd.factorize(scenes[0])[0])
-
-
-def _by_goal(table: pd.DataFrame, metric: str) -> list[np.ndarray]:
-    """Scenes, goals, numerators and denominators of a metric, sorted by scene and goal."""
-    rows = np.flatnonzero(table.metric == metric)
-    rows = rows[np.lexsort((table.goal.to_numpy()[rows], table.scene.cat.codes.to_numpy()[rows]))]
-    return [table[name].array[rows].to_numpy() for name in ("scene", "goal", *_SUMMED)]
 
 
 def distance_to_trained(scenes: SceneSet, scene: Tensor, goal: Tensor, trained: Tensor) -> Tensor:

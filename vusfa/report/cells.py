@@ -8,10 +8,12 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from vusfa.deploy.agents import pretrained_names
 from vusfa.errors import ConfigError
 from vusfa.experiments import runs as results
 from vusfa.modules.config import MODELS
 from vusfa.report.curve import read_metrics
+from vusfa.report.run_agents import pretrained_of, pretrained_run
 from vusfa.report.runs import LoggedRun, read_run, split_name
 
 __all__ = ["read_source", "result_run"]
@@ -22,7 +24,9 @@ def read_source(source: str | Path, mode: str = "sampled", runs: str | Path = "r
 
     Args:
         source: folder of a run of vusfa train, of one run of results, or of a sweep or an experiment, all of
-            whose runs are read; ``NAME=FOLDER`` calls the model NAME. A sweep's ``multirun.yaml`` is no run.
+            whose runs are read; or the name of a pretrained agent, see
+            :func:`~vusfa.report.run_agents.pretrained_run`. ``NAME=FOLDER`` calls the model NAME. A sweep's
+            ``multirun.yaml`` is no run.
         mode: of the evaluation, ``sampled`` or ``greedy``.
         runs: folder of logs and checkpoints, ``RUNS/EXPERIMENT/RUN``.
 
@@ -33,13 +37,18 @@ def read_source(source: str | Path, mode: str = "sampled", runs: str | Path = "r
     >>> read_source("/no/such/folder")
     Traceback (most recent call last):
     ...
-    vusfa.errors.ConfigError: /no/such/folder is not a folder; give the folder of a run or of results
+    vusfa.errors.ConfigError: /no/such/folder is not a folder; give the folder of a run or of results, ...
     """
     label, folder = split_name(source)
     if folder.name == "multirun.yaml" and folder.is_file():
         return []
+    if not folder.exists() and str(folder) in pretrained_names():
+        return [pretrained_run(str(folder), label)]
     if not folder.is_dir():
-        raise ConfigError(f"{folder} is not a folder; give the folder of a run or of results")
+        raise ConfigError(
+            f"{folder} is not a folder; give the folder of a run or of results, or a pretrained agent"
+            f" ({', '.join(pretrained_names())})"
+        )
     if (folder / "cell.json").is_file():
         return [result_run(folder, label, mode, runs)]
     if (folder / "config.json").is_file():
@@ -82,7 +91,7 @@ def result_run(folder: Path, label: str = "", mode: str = "sampled", runs: str |
     settings["overrides"] = [text for text in info.get("overrides", ()) if not str(text).startswith("seed=")]
     if (kept / "config.json").is_file():  # it has the scenes' files, too
         settings = dict(read_run(kept).settings)
-    return LoggedRun(
+    logged = LoggedRun(
         label or run.label,
         run.seed,
         folder,
@@ -96,6 +105,7 @@ def result_run(folder: Path, label: str = "", mode: str = "sampled", runs: str |
         {"frames": _number(info, "frames"), "seconds": _number(info, "training_s")},
         info.get("scenes_fingerprint", ""),
     )
+    return pretrained_of(logged)
 
 
 def _order(run: LoggedRun) -> tuple[int, str, int]:

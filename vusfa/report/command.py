@@ -28,7 +28,7 @@ def report_runs(
     *,
     out: Path = Path("report.html"),
     title: str = "What the runs learned",
-    goals_per_scene: int = 24,
+    goals_per_scene: int | None = None,
     seeds: int = 1,
     walks: int = 3,
     max_steps: int = MAX_STEPS,
@@ -44,13 +44,14 @@ def report_runs(
 
     Its tables are written beside it as CSV, unrounded, in the folder PAGE_tables. NAME=FOLDER calls a model
     NAME, which must not be an option's; runs of one name are seeds of one model, unless their settings
-    differ.
+    differ. vusfa report vusfa shows a pretrained agent, without a training.
 
     Args:
-        sources: folders of runs of vusfa train, of results, of sweeps or of experiments.
+        sources: folders of runs of vusfa train, of results, of sweeps or of experiments; names of pretrained
+            agents.
         out: the page.
         title: of the page.
-        goals_per_scene: most goals per scene in the explorer.
+        goals_per_scene: most goals per scene in the explorer; as many as megabytes allows by default.
         seeds: runs per model in the explorer, the first ones given.
         walks: sampled episodes to each of these goals.
         max_steps: limit of actions of these episodes.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import platform
+from bisect import bisect_right
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -15,6 +16,7 @@ from vusfa.errors import ConfigError
 from vusfa.evaluation import get_metric, random_walk
 from vusfa.evaluation.baselines import RANDOM_WALK
 from vusfa.evaluation.summary import metric_columns
+from vusfa.modules import Agent
 from vusfa.report.by_goal import distance_rows, goal_rows
 from vusfa.report.curves import learning_curves
 from vusfa.report.explorer import choose_goals, choose_starts, sampled_walks, state_maps
@@ -22,18 +24,18 @@ from vusfa.report.geometry import dart_path, floor_plan
 from vusfa.report.grouping import separate_runs
 from vusfa.report.packing import pack
 from vusfa.report.pictures import thumbnails
+from vusfa.report.run_agents import open_agent_of
 from vusfa.report.run_scenes import open_scenes
 from vusfa.report.runs import LoggedRun
 from vusfa.report.tables import baseline_rows, run_rows, seed_rows, summary_rows
 from vusfa.scenes import Scene, SceneSet
-from vusfa.training.checkpoint import load_checkpoint, saved_agent
 
 __all__ = ["Options", "add_pictures", "gather", "goal_limit", "tables"]
 
 Row = dict[str, Any]
 
 _BYTES_A_STATE = 16  # of one goal's maps, in base 64: value, three components, four probabilities
-_SHARE_OF_MAPS = 0.4
+_SHARE_OF_MAPS = 0.6
 
 
 @dataclass(frozen=True)
@@ -43,9 +45,9 @@ class Options:
     Args:
         title: of the page.
         within: limits of actions to report success for.
-        goals_per_scene: most goals per scene in the explorer.
+        goals_per_scene: most goals per scene in the explorer; None for as many as the page's size allows.
         seeds: runs per model in the explorer, the first ones.
-        walks: sampled episodes to each of these goals.
+        walks: sampled episodes to each of these goals. Those of agents of one frame are sampled in the page.
         max_steps: limit of actions of these episodes.
         megabytes: size limit of the page.
         command: that makes the page again.
@@ -56,7 +58,7 @@ class Options:
 
     title: str = "What the runs learned"
     within: Sequence[int] = (500, 100)
-    goals_per_scene: int = 24
+    goals_per_scene: int | None = None
     seeds: int = 1
     walks: int = 3
     max_steps: int = MAX_STEPS
@@ -90,13 +92,21 @@ def tables(runs: Sequence[LoggedRun], scenes: Mapping[str, Scene], options: Opti
 def goal_limit(states: Sequence[int], agents: int, options: Options) -> int:
     """Goals per scene in the explorer within the size limit of the page.
 
+    Args:
+        states: number of states of each scene.
+        agents: number of agents in the explorer.
+        options: for ``goals_per_scene`` and ``megabytes``.
+
+    >>> goal_limit([176, 404, 680, 452], 1, Options())
+    680
     >>> goal_limit([176, 404, 680, 452], 4, Options())
-    24
-    >>> goal_limit([176, 404, 680, 452], 40, Options(megabytes=10))
-    3
+    228
     """
-    room = options.megabytes * 1e6 * _SHARE_OF_MAPS
-    return max(1, min(options.goals_per_scene, int(room / max(1, sum(states) * agents * _BYTES_A_STATE))))
+    room = options.megabytes * 1e6 * _SHARE_OF_MAPS / (max(1, agents) * _BYTES_A_STATE)
+    most = max(states, default=1)
+    asked = most if options.goals_per_scene is None else options.goals_per_scene
+    limits = range(1, min(most, asked) + 1)  # the weight grows with the limit
+    return max(1, bisect_right(limits, room, key=lambda k: sum(min(k, size) * size for size in states)))
 
 
 def gather(
@@ -130,8 +140,9 @@ def gather(
         for label in labels
         for run in [run for run in runs if run.label == label and run.checkpoint][: options.seeds]
     ]
-    limit = goal_limit([scene.num_states for scene in scenes.values()], len(shown), options)
-    if limit < options.goals_per_scene:
+    sizes = [scene.num_states for scene in scenes.values()]
+    limit, asked = goal_limit(sizes, len(shown), options), options.goals_per_scene or max(sizes, default=1)
+    if shown and limit < min(asked, max(sizes)):
         options.tell(f"the explorer has {limit} goals per scene, to limit the size of the page")
     goals = {name: _explored_goals(scene, rows["goals"], limit) for name, scene in scenes.items()}
     options.tell("floor maps")
@@ -153,7 +164,7 @@ def gather(
         "scenes": {name: floor_plan(scene) for name, scene in scenes.items()},
         "maps": _success_maps(rows["goals"], scenes, options.within),
         "goals": goals,
-        "goals_asked": options.goals_per_scene,
+        "goals_asked": asked,
         "goals_limit": limit,
         "agents": [],
     }
@@ -189,7 +200,7 @@ def add_pictures(content: dict[str, Any], scenes: Mapping[str, Scene], budget: i
     total = sum(scene.num_states for scene in scenes.values() if scene.has_pictures)
     for name, scene in scenes.items():
         walks = [agent["scenes"][name]["walks"] for agent in content["agents"] if name in agent["scenes"]]
-        visited = [state for goals in walks for ways in goals for way in ways for state in way]
+        visited = [state for goals in walks for ways in goals or () for way in ways for state in way]
         share = int(budget * scene.num_states / total * 3 / 4) if scene.has_pictures else 0
         content["scenes"][name]["pictures"] = thumbnails(scene, [*content["goals"][name], *visited], share)
 
@@ -247,41 +258,54 @@ def _is_share(name: str) -> bool:
 def _explored(
     run: LoggedRun, opened: Mapping[str, Scene], goals: Mapping[str, Sequence[int]], options: Options
 ) -> Row:
-    assert run.checkpoint is not None
-    state = load_checkpoint(run.checkpoint)
-    scenes = SceneSet([opened[name] for name in state["scenes"]["names"]])
-    agent = saved_agent(run.checkpoint, state, scenes)
-    config, found = agent.config, {}
+    saved = open_agent_of(run, opened)
+    agent, scenes = saved.agent, saved.scenes
+    tabular, found = agent.is_tabular, {}
     for index, scene in enumerate(scenes.scenes):
         chosen = goals[scene.name]
         maps = state_maps(agent, scenes, index, chosen)
-        pairs = [(start, goal) for goal in chosen for start in choose_starts(scene, goal, options.walks)]
-        starts, ends = (scenes.global_id(index, [pair[place] for pair in pairs]) for place in (0, 1))
-        ways = sampled_walks(agent, scenes, starts, ends, options.max_steps, seed=run.seed)
-        by_goal: dict[int, list[list[int]]] = {goal: [] for goal in chosen}
-        for (_, goal), way in zip(pairs, ways, strict=True):
-            by_goal[goal].append(scenes.local_id(way).tolist())
+        starts = {goal: choose_starts(scene, goal, options.walks) for goal in chosen}
         found[scene.name] = {
             "value": pack(maps.value, "u8"),
             "probabilities": pack(maps.probabilities, "u16", 0.0, 1.0),
             "components": None if maps.components is None else _symmetric(maps.components),
             "explained": None if maps.explained is None else maps.explained.tolist(),
-            "walks": list(by_goal.values()),
+            "starts": list(starts.values()),
+            "walks": None if tabular else _walks(run, agent, scenes, index, starts, options),
         }
     return {
         "name": run.name,
         "model": run.label,
         "seed": run.seed,
-        "frames": state["frames"],
-        "history": config["history"],
-        "markov": config["history"] == 1 and config["memory"] is None,
+        "frames": saved.frames,
+        "gamma": saved.gamma,
+        "history": agent.config["history"],
+        "markov": tabular,
         "trained": {
-            scene.name: scenes.local_id(state["goals"][scenes.scene_id[state["goals"]] == index]).tolist()
+            scene.name: scenes.local_id(saved.goals[scenes.scene_id[saved.goals] == index]).tolist()
             for index, scene in enumerate(scenes.scenes)
         },
         "max_steps": options.max_steps,
         "scenes": found,
     }
+
+
+def _walks(
+    run: LoggedRun,
+    agent: Agent,
+    scenes: SceneSet,
+    index: int,
+    starts: Mapping[int, Sequence[int]],
+    options: Options,
+) -> list[list[list[int]]]:
+    """Sampled episodes to each goal, of an agent that the page cannot walk itself."""
+    pairs = [(start, goal) for goal, begins in starts.items() for start in begins]
+    begins, ends = (scenes.global_id(index, [pair[place] for pair in pairs]) for place in (0, 1))
+    ways = sampled_walks(agent, scenes, begins, ends, options.max_steps, seed=run.seed)
+    by_goal: dict[int, list[list[int]]] = {goal: [] for goal in starts}
+    for (_, goal), way in zip(pairs, ways, strict=True):
+        by_goal[goal].append(scenes.local_id(way).tolist())
+    return list(by_goal.values())
 
 
 def _symmetric(components: torch.Tensor) -> list[Row]:

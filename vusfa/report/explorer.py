@@ -26,12 +26,13 @@ __all__ = [
     "StateMaps",
     "choose_goals",
     "choose_starts",
-    "principal_components",
+    "principal_axes",
     "sampled_walks",
     "state_maps",
 ]
 
-_ROWS = 65536  # pairs of state and goal per batch
+_ROWS = 32768  # pairs of state and goal per batch
+_PAIRS_FOR_AXES = 16384
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,6 +58,9 @@ def state_maps(
 ) -> StateMaps:
     """Evaluate an agent at every state of a scene, for some goals.
 
+    The directions of the principal components are those of at most 16,384 pairs of state and goal, spread
+    evenly.
+
     Args:
         agent: in evaluation mode, on the scenes' device.
         scenes: the world.
@@ -76,30 +80,33 @@ def state_maps(
     local = torch.arange(num_states, device=device).repeat(len(goals))
     state = scenes.global_id(scene, local)
     goal = scenes.global_id(scene, torch.tensor(goals, device=device)).repeat_interleave(num_states)
-    parts: dict[str, list[Tensor]] = {"value": [], "probabilities": [], "psi": []}
+    parts: dict[str, list[Tensor]] = {"value": [], "probabilities": [], "components": []}
+    axes: tuple[Tensor, Tensor, Tensor] | None = None
     with set_exploration_type(ExplorationType.DETERMINISTIC):
-        for rows in torch.arange(len(state), device=device).split(_ROWS):
+        spread = torch.linspace(0, len(state) - 1, min(len(state), _PAIRS_FOR_AXES), device=device).long()
+        for rows in [spread, *torch.arange(len(state), device=device).split(_ROWS)]:
             batch = _standing(scenes, state[rows], goal[rows], agent.config["history"], observe)
+            if rows is spread:
+                if "successor_features" in (judged := critic(batch)).keys():
+                    axes = principal_axes(judged["successor_features"].cpu(), num_components)
+                continue
             probabilities = actor.get_dist(batch.clone(recurse=False)).probs
             judged = critic(batch)
             parts["probabilities"].append(probabilities.float().cpu())
             parts["value"].append(judged["state_value"].squeeze(-1).float().cpu())
-            if "successor_features" in judged.keys():
-                parts["psi"].append(judged["successor_features"].float().cpu())
+            if axes is not None:
+                centred = judged["successor_features"].cpu().double() - axes[0]
+                parts["components"].append((centred @ axes[1]).float())
     shape = (len(goals), num_states)
-    components, explained = None, None
-    if parts["psi"]:
-        components, explained = principal_components(torch.cat(parts["psi"]), num_components)
-        components = components.reshape(*shape, -1)
     return StateMaps(
         torch.cat(parts["value"]).reshape(shape),
         torch.cat(parts["probabilities"]).reshape(*shape, -1),
-        components,
-        explained,
+        None if axes is None else torch.cat(parts["components"]).reshape(*shape, -1),
+        None if axes is None else axes[2],
     )
 
 
-def principal_components(values: Tensor, count: int) -> tuple[Tensor, Tensor]:
+def principal_axes(values: Tensor, count: int) -> tuple[Tensor, Tensor, Tensor]:
     """The first principal components of rows, each with the sign that makes its largest coordinate positive.
 
     Args:
@@ -107,21 +114,22 @@ def principal_components(values: Tensor, count: int) -> tuple[Tensor, Tensor]:
         count: K, at most E.
 
     Returns:
-        (n, K) coordinates about the mean, and (K,) shares of the variance (0 where there is none).
+        (E,) mean and (E, K) directions, both float64; (K,) shares of the variance (0 where there is none).
 
     >>> line = torch.tensor([[0.0, 0.0], [1.0, 1.0], [2.0, 2.0]])
-    >>> found, share = principal_components(line, 1)
-    >>> [f"{x:.2f}" for x in found.abs().flatten().tolist()], share.tolist()
-    (['1.41', '0.00', '1.41'], [1.0])
+    >>> mean, directions, share = principal_axes(line, 1)
+    >>> mean.tolist(), [f"{x:.2f}" for x in directions.abs().flatten().tolist()], share.tolist()
+    ([1.0, 1.0], ['0.71', '0.71'], [1.0])
     """
-    centred = values.double() - values.double().mean(0)
+    mean = values.double().mean(0)
+    centred = values.double() - mean
     variances, directions = torch.linalg.eigh(centred.T @ centred)
     order = variances.argsort(descending=True)[:count]
     found = centred @ directions[:, order]
     largest = found.gather(0, found.abs().argmax(0, keepdim=True))
     total = variances.clamp(min=0).sum()
     share = variances[order].clamp(min=0) / total if total > 0 else torch.zeros(len(order)).double()
-    return (found * torch.where(largest < 0, -1.0, 1.0)).float(), share.float().clamp(max=1.0)
+    return mean, directions[:, order] * torch.where(largest < 0, -1.0, 1.0), share.float().clamp(max=1.0)
 
 
 def sampled_walks(

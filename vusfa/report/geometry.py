@@ -8,10 +8,11 @@ from typing import Any
 import numpy as np
 
 from vusfa.report.packing import pack_ids
+from vusfa.report.room_plan import plan_of, plan_shapes
 from vusfa.scenes import Scene
 from vusfa.scenes.poses import dart, step_length
 
-__all__ = ["dart_path", "floor_plan", "outline", "slices"]
+__all__ = ["blocked_edges", "dart_path", "floor_plan", "outline", "slices"]
 
 _HALF = 0.47  # of the square that a place is drawn as; the unit is the distance between neighbouring places
 _WHOLE = 359.9  # a slice of as many degrees is the whole square
@@ -99,11 +100,13 @@ def floor_plan(scene: Scene) -> dict[str, Any]:
         plain data: name, states (N), actions (names), width and height of the map, metre (its length; None
         where the places are made up), x, y (N, centres of the squares), middles (N pairs, a point within each
         slice), paths (N, :func:`outline` of each slice), heading (N, degrees), next (packed (N, A): the state
-        each action leads to; a blocked one leads back).
+        each action leads to; a blocked one leads back); room (rectangle), solids (rectangles) and things
+        (rect, kind, name) where the room's plan is known, see :mod:`vusfa.report.room_plan`, else edges, see
+        :func:`blocked_edges`. Rectangles are x, y, width, height.
 
     >>> plan = floor_plan(Scene.bundled("bathroom"))
-    >>> plan["states"], plan["metre"], len(plan["paths"])
-    (176, 2.0, 176)
+    >>> plan["states"], plan["metre"], len(plan["paths"]), plan["things"][0]["name"]
+    (176, 2.0, 176, 'Bath')
     """
     location, rotation = scene.location.numpy(), scene.rotation.numpy()
     centre, first, last = slices(location, rotation)
@@ -116,7 +119,22 @@ def floor_plan(scene: Scene) -> dict[str, Any]:
     graph = scene.graph.numpy()
     stay = np.arange(len(graph))[:, None]
     width, height = ((high - low) / cell + 1).tolist()
-    return {
+    known = plan_of(scene) if metric else None
+    drawn: dict[str, Any] = {"edges": blocked_edges(scene, x, y) if metric else []}
+    if known is not None:
+
+        def placed(rect: list[float]) -> list[float]:
+            x0, z0, x1, z1 = rect
+            corner = [(x0 - low[0]) / cell + 0.5, (high[1] - z1) / cell + 0.5]
+            return [round(float(number), 3) for number in (*corner, (x1 - x0) / cell, (z1 - z0) / cell)]
+
+        shapes = plan_shapes(known, scene)
+        drawn = {
+            "room": placed(shapes["room"]),
+            "solids": [placed(rect) for rect in shapes["solids"]],
+            "things": [thing | {"rect": placed(thing["rect"])} for thing in shapes["things"]],
+        }
+    return drawn | {
         "name": scene.name,
         "states": scene.num_states,
         "actions": list(scene.actions),
@@ -130,3 +148,34 @@ def floor_plan(scene: Scene) -> dict[str, Any]:
         "heading": np.round(rotation, 2).tolist(),
         "next": pack_ids(np.where(graph < 0, stay, graph)),
     }
+
+
+def blocked_edges(scene: Scene, x: np.ndarray, y: np.ndarray) -> list[list[float]]:
+    """Edges of squares that a step forward cannot cross: a wall or furniture, a dump does not tell which.
+
+    Args:
+        scene: the scene; without an action MoveForward nothing is known.
+        x, y: (N,) centres of the squares, y downwards.
+
+    Returns:
+        lines x0, y0, x1, y1, for headings along the grid.
+
+    >>> import torch
+    >>> hall = Scene("hall", torch.tensor([[1], [-1]]), torch.rand(2, 1, 2), actions=("MoveForward",))
+    >>> blocked_edges(hall, np.array([0.5, 0.5]), np.array([1.5, 0.5]))
+    [[0.0, 0.0, 1.0, 0.0]]
+    """
+    if "MoveForward" not in scene.actions:
+        return []
+    blocked = scene.graph[:, scene.actions.index("MoveForward")].numpy() < 0
+    heading = scene.rotation.numpy()
+    straight = np.abs(np.mod(heading + 45, 90) - 45) < 1
+    lines = set()
+    for state in np.flatnonzero(blocked & straight).tolist():
+        turn = math.radians(round(float(heading[state]) / 90) * 90)
+        right, up = math.sin(turn), math.cos(turn)
+        middle = x[state] + right / 2, y[state] - up / 2
+        side = abs(up) / 2, abs(right) / 2
+        ends = middle[0] - side[0], middle[1] - side[1], middle[0] + side[0], middle[1] + side[1]
+        lines.add(tuple(round(float(end), 3) + 0.0 for end in ends))
+    return [list(line) for line in sorted(lines)]

@@ -48,7 +48,7 @@ def _world(
     run: LoggedRun, given: SceneSet | None, opened: Callable[[tuple[str, ...]], SceneSet]
 ) -> SceneSet | None:
     saved: dict[str, Any] = {"sources": run.scenes, "fingerprint": run.fingerprint}
-    if run.checkpoint is not None:
+    if run.checkpoint is not None and run.checkpoint.suffix != ".safetensors":
         saved = load_checkpoint(run.checkpoint)["scenes"]
     if given is not None:
         every = given.names if run.episodes is None else run.episodes.scene_names

@@ -116,9 +116,7 @@ def summary_rows(
     return rows
 
 
-def baseline_rows(
-    runs: Sequence[LoggedRun], scenes: SceneSet, within: Sequence[int] = WITHIN
-) -> list[Row]:
+def baseline_rows(runs: Sequence[LoggedRun], scenes: SceneSet, within: Sequence[int] = WITHIN) -> list[Row]:
     """:func:`reference_rows` of the first run with each set of goals, scene by scene.
 
     Args:
