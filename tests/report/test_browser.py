@@ -13,10 +13,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import torch
 
 from vusfa.report import Options, read_run, write_report
 from vusfa.report.runs import LoggedRun
 from vusfa.scenes import Scene
+from vusfa.scenes.markov import arrival_probability
 
 pytestmark = pytest.mark.browser
 
@@ -136,7 +138,7 @@ def test_the_explorer_follows_its_controls(tab: Any):
     tab.select_option("#x-scene", "bathroom")
     tab.select_option("#x-goal", index=0)
     layers: dict[str, list[str]] = {}
-    for layer in ("value", "psi0", "psi1", "psi2", "sure", "togo"):
+    for layer in ("value", "occupancy", "arrive", "psi0", "psi1", "psi2", "sure", "togo"):
         tab.select_option("#x-layer", layer)
         layers[layer] = colours(tab, "#x-map")
     assert len({tuple(found) for found in layers.values()}) == len(layers)
@@ -156,6 +158,139 @@ def test_the_explorer_follows_its_controls(tab: Any):
     assert colours(tab, "#x-map") != before
     assert "has no ψ" in tab.inner_text("#x-note")
     assert not any("ψ" in text for text in tab.locator("#x-layer option").all_inner_texts())
+    tab.select_option("#x-agent", label="vusfa, seed 0")
+    share = tab.evaluate("viewNow().explained[0]")
+    (named,) = (text for text in tab.locator("#x-layer option").all_inner_texts() if "component 1" in text)
+    assert named == f"ψ, principal component 1 ({100 * share:.0f}\u00a0% of its variance)"
+
+
+def test_the_page_computes_what_the_package_computes(tab: Any):
+    """Arrival by the backward equation, occupancy by the forward one: their own numbers on both sides."""
+    tab.select_option("#x-agent", label="vusfa, seed 0")
+    tab.select_option("#x-scene", "bathroom")
+    goal, graph = int(tab.input_value("#x-goal")), Scene.bundled("bathroom").graph
+    shares = torch.tensor(tab.evaluate("[...sharesNow()]")).view(1, -1, 4).double()
+    shares /= shares.sum(-1, keepdim=True)
+    found = torch.tensor(tab.evaluate("[...arrivalNow()]"))
+    assert torch.allclose(found, arrival_probability(graph, shares, goal, 30)[0].float(), atol=1e-3)
+    start = tab.evaluate("at.way[0]")
+    visits = torch.tensor(tab.evaluate(
+        "[...occupancy(drawing('bathroom'), sharesNow(), 4, at.way[0], goalNow(), 0.9, 1000)]"
+    )).double()  # fmt: skip
+    stay = torch.arange(len(graph))[:, None].expand_as(graph)
+    moves = torch.zeros(len(graph), len(graph)).double()
+    moves.scatter_add_(1, torch.where(graph < 0, stay, graph), shares[0])
+    moves[goal] = 0  # where the episode ends
+    expected = torch.linalg.inv(torch.eye(len(graph)).double() - 0.9 * moves)[start]
+    assert torch.allclose(visits, expected, atol=1e-3)
+
+
+def test_the_first_goal_is_one_that_is_reached(tab: Any):
+    tab.select_option("#x-agent", label="vusfa, seed 0")
+    shares = tab.evaluate("ranked().slice(0, TRIED).map(reached)")
+    assert tab.evaluate("bestGoal().share") == max(shares)
+    assert tab.evaluate("worstGoal().share") <= min(shares)
+
+
+def test_a_link_opens_a_state(tab: Any, page: Path):
+    goal = tab.evaluate("DATA.goals.bedroom[5]")
+    tab.evaluate(f"location.hash = '#agent=gvf%2C+seed+0&scene=bedroom&goal={goal}&color=arrive&from=17'")
+    until(tab, f"document.getElementById('x-goal').value === '{goal}' && at.way[0] === 17")
+    assert tab.evaluate("[agentNow().name, sceneNow(), $('x-layer').value, at.way[0]]") == [
+        "gvf, seed 0",
+        "bedroom",
+        "arrive",
+        17,
+    ]
+    assert tab.locator("#x-notice").is_hidden()
+    way = tab.evaluate("at.way")
+    tab.select_option("#x-layer", "value")
+    assert tab.evaluate("location.hash") == f"#agent=gvf%2C+seed+0&scene=bedroom&goal={goal}&from=17"
+    tab.evaluate("show({agent: 0, scene: 'bathroom'}); readLink()")
+    assert tab.evaluate("at.way") == way  # the same link, the same episode
+
+
+@pytest.mark.parametrize(
+    ("link", "said"),
+    [
+        ("scene=cellar", "scene “cellar” (there are bathroom, bedroom)"),
+        ("scene=bathroom&goal=176", "goal “176”"),
+        ("goal=-1&color=<b>", "goal “-1”; color “<b>”"),
+        ("agent=nobody", "agent “nobody” (there are vusfa, seed 0, gvf, seed 0)"),
+    ],
+)
+def test_a_link_to_what_is_not_there(tab: Any, link: str, said: str):
+    tab.evaluate(f"location.hash = '#{link}'")
+    until(tab, "!document.getElementById('x-notice').hidden")
+    assert said in tab.inner_text("#x-notice")
+    assert len(colours(tab, "#x-map")) in (176, 404)
+    tab.evaluate("notice(''); history.replaceState(null, '', '#')")
+
+
+def test_a_goal_that_is_not_on_the_page_opens_the_nearest(tab: Any):
+    wanted = tab.evaluate("[...Array(404).keys()].find((state) => !DATA.goals.bedroom.includes(state))")
+    row = tab.locator("#map-grid .map-row").first
+    row.locator(".floor").nth(1).locator(f'path.s[data-i="{wanted}"]').dispatch_event("click")
+    assert f"the nearest one to {wanted}" in tab.inner_text("#x-notice")
+    near = int(tab.input_value("#x-goal"))
+    room, goals = Scene.bundled("bedroom"), tab.evaluate("DATA.goals.bedroom")
+    far = (room.location[goals] - room.location[wanted]).norm(dim=1)
+    assert (room.location[near] - room.location[wanted]).norm() <= far.min() + 0.3
+
+
+def test_the_first_minute(tab: Any):
+    for step, layer in ((1, "value"), (2, "occupancy"), (3, "arrive")):
+        tab.click(f"#guide-{step}")
+        assert tab.input_value("#x-layer") == layer
+        assert tab.get_attribute(f"#guide-{step}", "aria-pressed") == "true"
+        assert "goal" in tab.inner_text("#guide-say")
+    tab.evaluate("pause()")
+
+
+def test_keys(tab: Any):
+    tab.evaluate("pause(); document.activeElement.blur()")
+    tab.select_option("#x-agent", label="vusfa, seed 0")
+    tab.select_option("#x-scene", "bathroom")
+    tab.evaluate("document.activeElement.blur()")
+    goal, layer = tab.input_value("#x-goal"), tab.input_value("#x-layer")
+    for key, away in (("g", "#x-goal"), ("c", "#x-layer")):
+        before = tab.input_value(away)
+        tab.keyboard.press(key)
+        assert tab.input_value(away) != before
+        tab.keyboard.press(key.upper())
+        assert tab.input_value(away) == before
+    assert (goal, layer) == (tab.input_value("#x-goal"), tab.input_value("#x-layer"))
+    tab.keyboard.press(".")
+    assert tab.input_value("#x-step") == "1"
+    tab.keyboard.press(",")
+    assert tab.input_value("#x-step") == "0"
+    tab.focus("#x-map")
+    start, room = tab.evaluate("at.way[0]"), Scene.bundled("bathroom")
+    tab.keyboard.press("ArrowRight")
+    tab.keyboard.press("ArrowLeft")
+    assert tab.evaluate("at.way") == [start, int(room.graph[start, 1]), start]
+    assert "You have taken 2 actions" in tab.inner_text("#x-status")
+    tab.keyboard.press("Enter")
+    assert tab.evaluate("[at.way[0], at.yours]") == [start, False]
+
+
+def test_labels_of_the_baselines_do_not_overlap(tab: Any):
+    for control, value in (("measure", "success_20"), ("subset", "unseen"), ("scene", "mean of scenes")):
+        tab.select_option(f"#{control}", value)
+    tab.evaluate("""() => {
+      window.kept = [...DATA.tables.summary];
+      for (const row of kept.filter((row) => row.model === "random walk"))
+        for (const model of ["untrained network", "another baseline", "a third"])
+          DATA.tables.summary.push({ ...row, model });
+      drawOverview();
+    }""")
+    labels = "[...document.querySelectorAll('#overview .annotation')]"
+    boxes = tab.evaluate(f"{labels}.map((one) => one.getBoundingClientRect().toJSON())")
+    assert len(boxes) == 5
+    for one, other in itertools.combinations(boxes, 2):
+        apart = one["right"] <= other["left"] + 1 or other["right"] <= one["left"] + 1
+        assert apart or one["bottom"] <= other["top"] + 2 or other["bottom"] <= one["top"] + 2
+    tab.evaluate("() => { DATA.tables.summary = kept; drawOverview(); }")
 
 
 def test_walks_go_along_the_graph_with_their_pictures(tab: Any):
@@ -224,6 +359,8 @@ def test_nothing_is_wider_than_the_screen(tab: Any, width: int):
     tab.set_viewport_size({"width": width, "height": 800})
     until(tab, f"document.querySelector('#overview .main-svg').clientWidth < {width}")
     assert tab.evaluate("document.documentElement.scrollWidth") <= width
+    button = tab.evaluate("document.getElementById('theme').getBoundingClientRect().toJSON()")
+    assert 0 < button["left"] < button["right"] <= width
 
 
 def test_nothing_is_fetched_from_outside(opened: tuple[Any, list[str], list[str]], page: Path):
@@ -263,6 +400,26 @@ def test_an_agent_with_a_past(
     tab.locator("#x-map path.s").first.dispatch_event("click")
     assert tab.evaluate("at.way") == way
     assert tab.locator("#map-grid .map-row").count() == 2
+    assert "arriving" not in tab.inner_text("#x-layer")
+    for step in (1, 2, 3):
+        tab.click(f"#guide-{step}")
+    tab.focus("#x-map")
+    tab.keyboard.press("ArrowLeft")
+    assert tab.locator("#x-map .edge").count() == 1  # no plan is known: the steps that are blocked
+    assert complaints == []
+    tab.close()
+
+
+def test_a_page_without_an_explorer_promises_none(chromium: Any, runs: list[LoggedRun], tmp_path: Path):
+    bare = [dataclasses.replace(runs[0], label="my_model", checkpoint=None)]
+    write_report(bare, tmp_path / "page.html")
+    tab, complaints = fresh_tab(chromium, tmp_path / "page.html")
+    assert tab.locator("#map-opens").is_hidden()
+    assert tab.locator("#explorer").is_hidden()
+    tab.locator("#map-grid path.s").first.dispatch_event("click")
+    assert "my_model" in tab.inner_text("#summary")
+    assert tab.evaluate("getComputedStyle(document.querySelector('#map-grid path.s')).cursor") != "pointer"
+    tab.evaluate("location.hash = '#scene=bathroom'")
     assert complaints == []
     tab.close()
 

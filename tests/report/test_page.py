@@ -56,7 +56,8 @@ def test_what_it_holds(page: Path, runs: list[LoggedRun]):
         assert unpack(view["value"]).shape == (8, count)
         chances = unpack(view["probabilities"])
         assert abs(chances.sum(-1) - 1).max() < 1e-3
-        assert [len(ways) for ways in view["walks"]] == [2] * 8
+        assert view["walks"] is None  # the page walks itself: this agent sees one frame
+        assert [len(starts) for starts in view["starts"]] == [2] * 8
         assert len(data["scenes"][name]["pictures"]["ids"]) == count
     episodes = runs[2].episodes
     assert episodes is not None
@@ -90,18 +91,20 @@ def test_too_heavy_without_a_picture(runs: list[LoggedRun], tmp_path: Path):
 
 
 def test_goals_are_fewer_where_the_page_would_be_too_heavy():
-    assert goal_limit([1000], 1, Options(goals_per_scene=10**6, megabytes=4)) == 100
-    assert goal_limit([1000], 10, Options(goals_per_scene=10**6, megabytes=4)) == 10
+    assert goal_limit([1000], 1, Options(goals_per_scene=10**6, megabytes=4)) == 150
+    assert goal_limit([1000], 10, Options(megabytes=4)) == 15
     assert goal_limit([10**9], 1, Options()) == 1
+    assert goal_limit([100, 1000], 1, Options(megabytes=2)) == 68  # 68 goals in both weigh 74,800 states
+    assert goal_limit([100, 200], 1, Options()) == 200
 
 
 def test_who_asks_for_too_many_goals_is_told(runs: list[LoggedRun]):
     lines: list[str] = []
     options = Options(goals_per_scene=99, megabytes=1, walks=1, max_steps=3, tell=lines.append)
     content, _ = gather(runs[:1], options)
-    assert content["goals_limit"] == 43 < content["goals_asked"] == 99
-    assert [len(goals) for goals in content["goals"].values()] == [43, 43]
-    assert "the explorer has 43 goals per scene, to limit the size of the page" in lines
+    assert content["goals_limit"] == 64 < content["goals_asked"] == 99
+    assert [len(goals) for goals in content["goals"].values()] == [64, 64]
+    assert "the explorer has 64 goals per scene, to limit the size of the page" in lines
 
 
 def test_every_seed_on_demand(runs: list[LoggedRun]):

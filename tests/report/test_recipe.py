@@ -33,6 +33,8 @@ def test_faults_in_one_line(tmp_path: Path):
     done = call(tmp_path / "none", "--out", tmp_path / "page.html")
     assert done.returncode == 1
     assert (
-        done.stderr == f"error: {tmp_path / 'none'} is not a folder; give the folder of a run or of results\n"
+        done.stderr
+        == f"error: {tmp_path / 'none'} is not a folder; give the folder of a run or of results, or"
+        " a pretrained agent (gvf, sfdp, usfa, vusfa)\n"
     )
     assert not list(tmp_path.iterdir())

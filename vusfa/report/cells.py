@@ -42,9 +42,8 @@ def read_source(source: str | Path, mode: str = "sampled", runs: str | Path = "r
     label, folder = split_name(source)
     if folder.name == "multirun.yaml" and folder.is_file():
         return []
-    if not folder.exists() and str(folder) in pretrained_names():
-        return [pretrained_run(str(folder), label)]
-    if not folder.is_dir():
+    known = str(folder) in pretrained_names()
+    if not folder.is_dir() and not known:
         raise ConfigError(
             f"{folder} is not a folder; give the folder of a run or of results, or a pretrained agent"
             f" ({', '.join(pretrained_names())})"
@@ -57,6 +56,8 @@ def read_source(source: str | Path, mode: str = "sampled", runs: str | Path = "r
     folders = sorted(path.parent for path in folder.glob("*/cell.json") if path.parent.name[0] != ".")
     if sweep and not folders:
         return [replace(run, label=label or run.label) for run in map(read_run, sweep)]
+    if not folders and known:  # a folder of runs of that name comes first
+        return [pretrained_run(str(folder), label)]
     if not folders:
         raise ConfigError(
             f"{folder} holds neither a run (config.json) nor results (cell.json); give the folder of a run of"

@@ -100,7 +100,7 @@ def goal_limit(states: Sequence[int], agents: int, options: Options) -> int:
     >>> goal_limit([176, 404, 680, 452], 1, Options())
     680
     >>> goal_limit([176, 404, 680, 452], 4, Options())
-    228
+    223
     """
     room = options.megabytes * 1e6 * _SHARE_OF_MAPS / (max(1, agents) * _BYTES_A_STATE)
     most = max(states, default=1)

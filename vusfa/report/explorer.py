@@ -17,7 +17,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from vusfa.envs.dynamics import MAX_STEPS, start_history
 from vusfa.evaluation import trails
 from vusfa.evaluation.navigation import Observe
-from vusfa.modules import Agent
+from vusfa.modules import Agent, TabularPolicy
 from vusfa.scenes import Scene, SceneSet
 from vusfa.scenes.poses import spread_poses
 from vusfa.training import make_observation
@@ -80,6 +80,7 @@ def state_maps(
     local = torch.arange(num_states, device=device).repeat(len(goals))
     state = scenes.global_id(scene, local)
     goal = scenes.global_id(scene, torch.tensor(goals, device=device)).repeat_interleave(num_states)
+    table = TabularPolicy(agent, scenes, goal) if agent.is_tabular and len(goals) else None
     parts: dict[str, list[Tensor]] = {"value": [], "probabilities": [], "components": []}
     axes: tuple[Tensor, Tensor, Tensor] | None = None
     with set_exploration_type(ExplorationType.DETERMINISTIC):
@@ -90,7 +91,10 @@ def state_maps(
                 if "successor_features" in (judged := critic(batch)).keys():
                     axes = principal_axes(judged["successor_features"].cpu(), num_components)
                 continue
-            probabilities = actor.get_dist(batch.clone(recurse=False)).probs
+            if table is None:
+                probabilities = actor.get_dist(batch.clone(recurse=False)).probs
+            else:  # one large product per scene
+                probabilities = table.probabilities(state[rows], goal[rows], batch["scene_id"])
             judged = critic(batch)
             parts["probabilities"].append(probabilities.float().cpu())
             parts["value"].append(judged["state_value"].squeeze(-1).float().cpu())

@@ -18,7 +18,7 @@ from vusfa.files import replacing, write_csv
 
 __all__ = ["as_json", "even", "make_page", "page_weight", "write_page", "write_tables"]
 
-_SCRIPTS = ("core.js", "charts.js", "floors.js", "explorer.js", "main.js")
+_SCRIPTS = ("core.js", "charts.js", "floors.js", "chain.js", "explorer.js", "guide.js", "main.js")
 
 
 def as_json(content: Any) -> str:

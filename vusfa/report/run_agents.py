@@ -12,7 +12,7 @@ from torch import Tensor
 from vusfa.deploy.agents import PRETRAINED, load_pretrained, pretrained_names, read_agent
 from vusfa.deploy.cards import card_head
 from vusfa.evaluation import evaluate
-from vusfa.modules import Agent, InferencePolicy
+from vusfa.modules import Agent, InferencePolicy, TabularPolicy
 from vusfa.report.curve import read_metrics
 from vusfa.report.runs import LoggedRun
 from vusfa.scenes import Scene, SceneSet
@@ -20,7 +20,7 @@ from vusfa.training.checkpoint import load_checkpoint, saved_agent
 
 __all__ = ["SavedAgent", "open_agent_of", "pretrained_of", "pretrained_run"]
 
-_EPISODES = 4  # per goal
+_EPISODES = 2  # per goal
 
 
 class SavedAgent(NamedTuple):
@@ -75,23 +75,16 @@ def pretrained_run(name: str, label: str = "") -> LoggedRun:
     """
     agent, scenes, goals, card = load_pretrained(name)
     facts = card_head(card)["vusfa"]
-    episodes = evaluate(
-        InferencePolicy(agent),
-        scenes,
-        trained=goals,
-        episodes_per_goal=_EPISODES,
-        history=agent.config["history"],
-    )
+    policy = TabularPolicy(agent, scenes) if agent.is_tabular else InferencePolicy(agent)
+    asked: dict[str, Any] = {"episodes_per_goal": _EPISODES, "history": agent.config["history"]}
+    episodes = evaluate(policy, scenes, trained=goals, **asked)
     log = PRETRAINED / f"{name}.csv"
     config = {"model": facts["model"], "history": agent.config["history"]}
     return LoggedRun(
         label or f"{name} (pretrained)",
         facts["seed"],
         PRETRAINED / name,
-        {
-            "agent": {"model": facts["model"], "history": agent.config["history"]},
-            "scenes": list(scenes.names),
-        },
+        {"agent": config, "scenes": list(scenes.names)},
         read_metrics(log) if log.is_file() else {},
         episodes,
         checkpoint=PRETRAINED / f"{name}.safetensors",

@@ -36,6 +36,23 @@ function rowsOf(table) {
   return DATA.tables[table].filter((row) => row.goals === goals && row.scene === scene);
 }
 
+// Words above the dashed lines: those that would overlap go to rows of their own.
+function labels(lines, range, models) {
+  const letter = 6.6, left = 20 + 8 * Math.max(0, ...models.map((name) => name.length)); // pixels; the axis takes as much
+  const width = Math.max(120, $("overview").clientWidth - left - 36);
+  const ends = [], notes = [];
+  for (const [text, x] of [...lines].sort((a, b) => a[1] - b[1])) {
+    const at = ((x - range[0]) / (range[1] - range[0])) * width, long = letter * text.length;
+    const xanchor = at + long / 2 > width ? "right" : at < long / 2 ? "left" : "center";
+    const begin = at - { right: long, left: 0, center: long / 2 }[xanchor];
+    let row = ends.findIndex((end) => begin > end + 8);
+    if (row < 0) row = ends.length;
+    ends[row] = begin + long;
+    notes.push({ text, x, xanchor, yshift: 15 * row, xref: "x", y: 1, yref: "paper", yanchor: "bottom", showarrow: false, font: { color: css("--muted"), size: 12 } });
+  }
+  return { notes, rows: ends.length };
+}
+
 function drawOverview() {
   const name = $("measure").value;
   const summary = rowsOf("summary");
@@ -63,14 +80,11 @@ function drawOverview() {
     line: { color: css("--muted"), width: 1.4, dash: "dash" },
   }));
   const values = [...traces.flatMap((trace) => trace.x), ...beside.map((row) => scaled(name, row[name]))].filter(known);
-  const most = Math.max(...values, 0);
-  const notes = beside.map((row, i) => ({
-    text: plain(row.model), yshift: narrow() ? 14 * i : 0, x: scaled(name, row[name]), xref: "x", y: 1, yref: "paper", yanchor: "bottom", showarrow: false, font: { color: css("--muted"), size: 12 },
-    xanchor: scaled(name, row[name]) > 0.85 * most ? "right" : scaled(name, row[name]) < 0.1 * most ? "left" : "center",
-  }));
+  const most = Math.max(...values, 0), range = isShare(name) ? [0, 102] : [0, 1.06 * most];
+  const { notes, rows } = labels(beside.map((row) => [plain(row.model), scaled(name, row[name])]), range, shown);
   plot("overview", traces, {
-    height: 120 + 46 * Math.max(2, shown.length), shapes: lines, annotations: notes, margin: { l: 20, r: 24, t: narrow() ? 44 : 30, b: 50 },
-    xaxis: { title: narrow() ? headOf(name) : titleOf(name), range: isShare(name) ? [0, 102] : [0, 1.06 * most], ticksuffix: isShare(name) ? " %" : "" },
+    height: 90 + 16 * rows + 46 * Math.max(2, shown.length), shapes: lines, annotations: notes, margin: { l: 20, r: 24, t: 14 + 16 * rows, b: 50 },
+    xaxis: { title: narrow() ? headOf(name) : titleOf(name), range, ticksuffix: isShare(name) ? " %" : "" },
     yaxis: { type: "category", categoryorder: "array", categoryarray: [...shown].reverse(), range: [-0.6, shown.length - 0.4], tickfont: { color: css("--ink"), size: 13 }, showgrid: false },
   });
 }
@@ -167,7 +181,7 @@ function drawCurves() {
   plot("curves", traces, {
     height: 400, hovermode: "x unified", showlegend: true,
     xaxis: { title: axis === "x" ? "frames (actions of all environments)" : "minutes of training", rangemode: "tozero", hoverformat: axis === "x" ? ",.0f" : ".1f" },
-    yaxis: { title: CURVES[measure] || measure, rangemode: "tozero", type: measure.endsWith("length_ratio") ? "log" : "linear", ticksuffix: factor === 100 ? " %" : "" },
+    yaxis: { title: narrow() ? measure.split("/").at(-1) : CURVES[measure] || measure, rangemode: "tozero", type: measure.endsWith("length_ratio") ? "log" : "linear", ticksuffix: factor === 100 ? " %" : "" },
   });
 }
 
@@ -178,7 +192,7 @@ function drawRuns() {
   const columns = [
     ["model", "model", String], ["seed", "seed", String], ["folder", "folder", String], ["frames", "frames", (v) => (known(v) ? grouped(v) : "–")],
     ["minutes", "minutes", (v) => (known(v) ? v.toFixed(1) : "–")], ["device", "device", String], ["history", "frames seen", (v) => (known(v) ? String(v) : "–")],
-    ["trained_success", "trained goals (%)", share], ["unseen_success", "unseen goals (%)", share], ["evaluated", "evaluated", String], ["scenes", "scenes", words],
+    ["trained_success", "trained goals (%)", share], ["unseen_success", "unseen goals (%)", share], ["evaluated", "evaluated", String], ["scenes", "scenes", String],
   ].filter(([key]) => logged(key));
   const left = (key) => (key === "scenes" ? { class: "left wrap" } : ["folder", "device", "evaluated"].includes(key) ? { class: "left" } : {});
   const head = make("tr", {}, ...columns.map(([key, title]) => make("th", left(key), title)));
@@ -193,12 +207,15 @@ function startCharts() {
   const subsets = unique("goals");
   fill($("measure"), SHOWN.map((name) => [name, titleOf(name)]), SHOWN[0]);
   fill($("subset"), subsets.map((name) => [name, name]), subsets.includes("unseen") ? "unseen" : subsets[0]);
-  fill($("scene"), [...scenes].sort((a, b) => b.startsWith("mean of") - a.startsWith("mean of")).map((name) => [name, words(name)]));
+  fill($("scene"), [...scenes].sort((a, b) => b.startsWith("mean of") - a.startsWith("mean of")).map((name) => [name, name]));
   fill($("distance-measure"), SHOWN.filter(isShare).map((name) => [name, titleOf(name)]));
   const curves = [...new Set(DATA.curves.map((curve) => curve.name))];
   fill($("curve"), curves.filter((name) => !name.startsWith("scene/")).map((name) => [name, CURVES[name] || name]));
+  $("learning-say").textContent = curves.some((name) => name.startsWith("eval/"))
+    ? "Success, SPL and length are those of evaluations towards fixed goals, with the weights of that moment; the other curves are of the training itself."
+    : "Each point summarizes the episodes that ended since the previous point. The first episodes to end are the short ones, so success begins high, then falls before it rises.";
   const curveScenes = [...new Set(curves.filter((name) => name.startsWith("scene/")).map((name) => name.split("/")[1]))];
-  fill($("curve-scene"), [["", "all scenes"], ...curveScenes.map((name) => [name, words(name)])]);
+  fill($("curve-scene"), [["", "all scenes"], ...curveScenes.map((name) => [name, name])]);
   for (const [ids, draw, wanted] of [
     [["measure", "subset", "scene"], drawOverview, rows.length], [["subset", "scene"], drawSummary, rows.length],
     [["distance-measure"], drawDistance, DATA.tables.distance.length], [["curve", "curve-scene", "curve-axis", "smooth"], drawCurves, curves.length],

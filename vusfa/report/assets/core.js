@@ -58,9 +58,18 @@ const MODELS = {
 const SYMBOLS = ["circle", "diamond", "square", "triangle-up", "cross", "x", "star", "hexagon"];
 const DASHES = ["solid", "dash", "dot", "dashdot", "longdash", "longdashdot", "solid", "dash"];
 const VIRIDIS = ["#440154", "#482878", "#3e4a89", "#31688e", "#26828e", "#1f9e89", "#35b779", "#6ece58", "#b5de2b", "#fde725"];
-const DIVERGING = ["#3b1f6b", "#5e4fa2", "#8073ac", "#b2abd2", "#e6e6ef", "#f7f7f7", "#fbe3c4", "#fdb863", "#e08214", "#b35806", "#7f3b08"];
+// Its middle, 0, is the ground of the page: what is far from 0 stands out in light and in dark.
+const DIVERGING = {
+  light: ["#3b1f6b", "#5e4fa2", "#8073ac", "#b2abd2", "#e6e6ef", "#f7f7f7", "#fbe3c4", "#fdb863", "#e08214", "#b35806", "#7f3b08"],
+  dark: ["#d9c8ff", "#b7a2f2", "#8f7bd4", "#66579c", "#3f3a5c", "#2b3138", "#56422c", "#8f5f24", "#cc8428", "#f5ab4c", "#ffd59a"],
+};
+const HEAT = {
+  light: ["#eef1f4", "#fde0a6", "#fdb863", "#ee7b3b", "#c43c4e", "#7a1f66", "#3b0f4f"],
+  dark: ["#20272e", "#4a2a52", "#8a2f5e", "#c94a4f", "#ee7b3b", "#fdb863", "#fff3cf"],
+};
 
 const theme = () => document.documentElement.dataset.theme;
+const tone = (stops) => (Array.isArray(stops) ? stops : stops[theme()]);
 const place = (label) => DATA.models.findIndex((model) => model.label === label);
 const colourOf = (label) => MODELS[theme()][Math.max(0, place(label)) % 8];
 const css = (name) => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
@@ -85,7 +94,7 @@ function faded(hex, opacity) {
 
 function drawScale(host, stops, low, high, unit) {
   const bar = make("i");
-  bar.style.background = `linear-gradient(90deg, ${stops.join(", ")})`;
+  bar.style.background = `linear-gradient(90deg, ${tone(stops).join(", ")})`;
   host.replaceChildren(low, bar, unit ? `${high} ${unit}` : high);
 }
 
@@ -96,7 +105,7 @@ const SHOWN = DATA.metrics.filter((metric) => !metric.exact).map((metric) => met
 const isShare = (name) => Boolean(METRICS[name]?.share);
 const headOf = (name) => METRICS[name].label;
 const titleOf = (name) => METRICS[name].title + (isShare(name) ? " (%)" : "");
-const words = (name) => String(name).replaceAll("_", " ");
+const plural = (count, word) => `${grouped(count)} ${word}${count === 1 ? "" : "s"}`;
 const known = (value) => value !== null && value !== undefined && Number.isFinite(value);
 
 function number(name, value) {
@@ -104,9 +113,10 @@ function number(name, value) {
   return ((isShare(name) ? 100 : 1) * value).toFixed(METRICS[name].digits);
 }
 
-// 99.95 % is not 100 %, nor is 0.3 % nothing
+// 99.95 % is not 100 %, nor is 0.03 % nothing
 function percent(value) {
   if (!known(value)) return "not known";
+  if (value > 0 && value < 0.001) return "under 0.1\u00a0%";
   const near = (value > 0.99 && value < 1) || (value > 0 && value < 0.01);
   return `${near ? (Math.floor(1000 * value) / 10).toFixed(1) : (100 * value).toFixed(0)}\u00a0%`;
 }

@@ -1,74 +1,76 @@
 // The explorer: one agent, one scene, one goal; its value and policy at every state, and an episode, step by step.
 
-const at = { map: null, mapScene: null, way: [], step: 0, timer: null, own: null };
+const at = { map: null, mapScene: null, way: [], step: 0, timer: null, own: null, yours: false, tries: 0, layer: null };
 
 const agentNow = () => DATA.agents[Number($("x-agent").value)];
 const sceneNow = () => $("x-scene").value;
-const goalIndex = () => DATA.goals[sceneNow()].indexOf(Number($("x-goal").value));
+const goalNow = () => Number($("x-goal").value);
 const viewNow = () => agentNow().scenes[sceneNow()];
+const widthNow = () => DATA.scenes[sceneNow()].actions.length;
+const inWords = (action) => action.replace(/(?<=[a-z])(?=[A-Z])/g, " ").toLowerCase();
 
-// Values of the chosen goal, one for each state, of a packed (goals, states) or (goals, states, actions).
-function slice(packed, width = 1) {
-  const count = DATA.scenes[sceneNow()].states * width;
-  return unpack(packed).subarray(goalIndex() * count, (goalIndex() + 1) * count);
+// Values of a goal, one for each state, of a packed (goals, states) or (goals, states, actions).
+function slice(packed, width = 1, goal = goalNow()) {
+  const count = DATA.scenes[sceneNow()].states * width, row = DATA.goals[sceneNow()].indexOf(goal);
+  return unpack(packed).subarray(row * count, (row + 1) * count);
 }
 
-// Fewest actions from every state to a goal: a search from the goal, backwards.
-function actionsToGo(scene, goal) {
-  const plan = DATA.scenes[scene], { next } = drawing(scene), width = plan.actions.length;
-  plan.back ||= (() => {
-    const back = Array.from({ length: plan.states }, () => []);
-    next.forEach((to, from) => back[to].push(Math.floor(from / width)));
-    return back;
-  })();
-  const togo = new Float32Array(plan.states).fill(NaN);
-  togo[goal] = 0;
-  for (let queue = [goal]; queue.length; ) {
-    const further = [];
-    for (const state of queue) for (const from of plan.back[state]) if (Number.isNaN(togo[from])) { togo[from] = togo[state] + 1; further.push(from); }
-    queue = further;
-  }
-  return togo;
+const sharesNow = (goal = goalNow()) => slice(viewNow().probabilities, widthNow(), goal);
+
+// Probability of arriving from every state; kept for the goal that was looked at last.
+function arrivalNow(goal = goalNow()) {
+  const key = `${$("x-agent").value}/${sceneNow()}/${goal}`;
+  if (at.arrival?.key !== key) at.arrival = { key, values: arrival(drawing(sceneNow()), sharesNow(goal), widthNow(), goal, agentNow().max_steps) };
+  return at.arrival.values;
 }
 
-function likeliest(shares, state, width) {
-  let best = 0;
-  for (let action = 1; action < width; action++) if (shares[state * width + action] > shares[state * width + best]) best = action;
-  return best;
-}
+const GAMMA = 0.99; // where a training does not tell its own
+
+const LAYERS = {
+  value: (view) => ({ values: slice(view.value), low: view.value.low, high: view.value.high, stops: VIRIDIS, unit: "discounted reward", say: "The reward that the agent expects from each pose on its way to this goal." }),
+  occupancy: () => {
+    const agent = agentNow(), gamma = agent.gamma ?? GAMMA;
+    const values = occupancy(drawing(sceneNow()), sharesNow(), widthNow(), at.way[at.step], goalNow(), gamma, agent.max_steps);
+    const high = Math.max(...values.filter((_, state) => state !== at.way[at.step]), 0.01);
+    return { values, low: 0, high, curve: (share) => Math.sqrt(share), stops: HEAT, unit: "visits", say: `Expected visits of each pose by an episode that begins at the white agent, discounted by ${gamma} per action. ψ predicts the same sum, of embeddings instead of visits.` };
+  },
+  arrive: () => ({ values: arrivalNow(), low: 0, high: 1, stops: VIRIDIS, unit: "", words: percent, say: `Probability of arriving within ${agentNow().max_steps} actions, computed from the policy.` }),
+  sure: (view) => {
+    const width = widthNow(), shares = slice(view.probabilities, width);
+    const values = Float32Array.from({ length: shares.length / width }, (_, state) => shares[state * width + likeliest(shares, state, width)]);
+    return { values, low: 1 / width, high: 1, stops: VIRIDIS, unit: "", words: percent, say: "How sure the agent is of its action." };
+  },
+  togo: () => {
+    const values = actionsToGo(sceneNow(), goalNow());
+    return { values, low: values.reduce((most, value) => Math.max(most, value || 0), 1), high: 0, stops: VIRIDIS, unit: "actions", words: (value) => value.toFixed(0), say: "What a perfect agent would need from each pose." };
+  },
+};
 
 function layerNow() {
-  const view = viewNow(), name = $("x-layer").value, width = DATA.scenes[sceneNow()].actions.length;
-  const two = (value) => value.toFixed(2).replace("-", "−");
-  if (name === "value") return { values: slice(view.value), low: view.value.low, high: view.value.high, stops: VIRIDIS, unit: "discounted reward", words: two };
-  if (name === "sure") {
-    const shares = slice(view.probabilities, width);
-    const values = Float32Array.from({ length: shares.length / width }, (_, state) => shares[state * width + likeliest(shares, state, width)]);
-    return { values, low: 1 / width, high: 1, stops: VIRIDIS, unit: "", words: percent };
-  }
-  if (name === "togo") {
-    const values = actionsToGo(sceneNow(), Number($("x-goal").value));
-    return { values, low: values.reduce((most, value) => Math.max(most, value || 0), 1), high: 0, stops: VIRIDIS, unit: "actions", words: (value) => value.toFixed(0) };
-  }
-  const packed = view.components[Number(name.slice(3))];
-  return { values: slice(packed), low: packed.low, high: packed.high, stops: DIVERGING, unit: "in the unit of ψ", words: two };
+  const view = viewNow(), name = $("x-layer").value;
+  const words = (value) => value.toFixed(2).replace("-", "−");
+  if (LAYERS[name]) return { words, ...LAYERS[name](view) };
+  const number = Number(name.slice(3)), packed = view.components[number];
+  const said = `Where ψ differs most between poses and goals${number ? `, apart from the ${number === 1 ? "first component" : `first ${number} components`}` : ""}. Its sign has no meaning of its own.`;
+  return { values: slice(packed), low: packed.low, high: packed.high, stops: DIVERGING, unit: "in the unit of ψ", words, say: said };
 }
 
 function paintExplorer() {
-  const layer = layerNow();
+  const layer = layerNow(), stops = tone(layer.stops), curve = layer.curve || ((share) => share);
   at.layer = layer;
-  at.map.paint((state) => ramp(layer.stops, (layer.values[state] - layer.low) / (layer.high - layer.low)));
+  at.map.paint((state) => ramp(stops, curve(Math.min(1, Math.max(0, (layer.values[state] - layer.low) / (layer.high - layer.low))))));
   drawScale($("x-scale"), layer.stops, layer.words(layer.low), layer.words(layer.high), layer.unit);
+  $("x-layer-say").textContent = layer.say;
   drawArrows();
 }
 
 function drawArrows() {
-  const host = at.map.layer("arrows"), scene = sceneNow(), plan = DATA.scenes[scene], width = plan.actions.length;
+  const host = at.map.layer("arrows"), scene = sceneNow(), plan = DATA.scenes[scene], width = widthNow();
   if (!$("x-arrows").checked) return host.replaceChildren();
-  const { middles, next } = drawing(scene), shares = slice(viewNow().probabilities, width);
+  const { middles, next } = drawing(scene), shares = sharesNow();
   const drawn = ["", "", "", ""]; // by how sure the agent is
   for (let state = 0; state < plan.states; state++) {
-    if (state === Number($("x-goal").value)) continue;
+    if (state === goalNow()) continue;
     const action = likeliest(shares, state, width), to = next[state * width + action];
     const level = Math.min(3, Math.max(0, Math.floor(((shares[state * width + action] - 1 / width) / (1 - 1 / width)) * 4)));
     const [x, y] = middles[state];
@@ -90,9 +92,9 @@ function dart(state, size, fill, edge) {
 }
 
 function drawWalk() {
-  const scene = sceneNow(), goal = Number($("x-goal").value), { x, y, width } = drawing(scene), size = Math.max(0.42, width * 0.026);
+  const scene = sceneNow(), goal = goalNow(), { x, y } = drawing(scene), pixel = 1 / at.map.scale, size = Math.max(0.42, 10 * pixel);
   const line = (states) => states.map((state) => `${x[state].toFixed(2)},${y[state].toFixed(2)}`).join(" ");
-  const stroke = Math.max(0.13, width * 0.008);
+  const stroke = Math.max(0.1, 3 * pixel);
   const trail = (states, color, thickness, opacity = 1) => svg("polyline", { class: "trail", points: line(states), stroke: color, "stroke-width": thickness, opacity });
   const walked = at.way.slice(0, at.step + 1);
   at.map.layer("trail").replaceChildren(trail(at.way, "#10151a", stroke * 1.7, 0.25), trail(walked, "#10151a", stroke * 1.9), trail(walked, "#ffffff", stroke));
@@ -103,28 +105,31 @@ function drawWalk() {
   $("x-step").max = at.way.length - 1;
   $("x-step").value = at.step;
   $("x-count").value = `${at.step} of ${at.way.length - 1}`;
+  if ($("x-layer").value === "occupancy") paintExplorer();
   drawActions(state);
 }
 
 function drawActions(state) {
-  const plan = DATA.scenes[sceneNow()], width = plan.actions.length, shares = slice(viewNow().probabilities, width), { next } = drawing(sceneNow());
-  const here = state === Number($("x-goal").value);
+  const plan = DATA.scenes[sceneNow()], width = plan.actions.length, shares = sharesNow(), { next } = drawing(sceneNow());
+  const here = state === goalNow();
   $("x-actions").replaceChildren(...plan.actions.flatMap((action, i) => {
     const share = shares[state * width + i];
     const bar = make("div", { class: "fill" });
     bar.style.width = `${(here ? 0 : 100 * share).toFixed(1)}%`;
     const wall = next[state * width + i] === state ? " (blocked)" : "";
-    return [make("span", {}, action.replace(/(?<=[a-z])(?=[A-Z])/g, " ").toLowerCase() + wall), make("div", { class: "track" }, bar), make("span", { class: "share" }, here ? "–" : percent(share))];
+    return [make("span", {}, inWords(action) + wall), make("div", { class: "track" }, bar), make("span", { class: "share" }, here ? "–" : percent(share))];
   }));
 }
 
-function showWalk(way) {
+function showWalk(way, step = 0) {
   pause();
   at.way = way;
-  at.step = 0;
-  const goal = Number($("x-goal").value), arrived = way.at(-1) === goal, shortest = actionsToGo(sceneNow(), goal)[way[0]], count = way.length - 1;
+  at.step = step;
+  const goal = goalNow(), arrived = way.at(-1) === goal, shortest = actionsToGo(sceneNow(), goal)[way[0]], count = way.length - 1;
   const best = Number.isFinite(shortest) ? `the shortest path has ${shortest}` : "there is no path";
-  $("x-status").textContent = arrived ? `Arrives after ${count} action${count === 1 ? "" : "s"}; ${best}.` : `Has not arrived after ${count} actions; ${best}.`;
+  const who = at.yours && way === at.own;
+  const lost = who ? `You have taken ${plural(count, "action")}` : `Has not arrived after ${count} actions`;
+  $("x-status").textContent = arrived ? `${who ? "You arrive" : "Arrives"} after ${plural(count, "action")}; ${best}.` : `${lost}; ${best}.`;
   drawWalk();
 }
 
@@ -141,7 +146,7 @@ function play() {
   $("x-play").textContent = "❚❚";
   $("x-play").setAttribute("aria-label", "Pause");
   at.timer = setInterval(() => {
-    at.step += 1;
+    at.step = Math.min(at.step + 1, at.way.length - 1);
     drawWalk();
     if (at.step >= at.way.length - 1) pause();
   }, at.way.length > 80 ? 60 : 220);
@@ -149,109 +154,193 @@ function play() {
 
 // An episode sampled in the page: correct for agents that see one frame, whose actions depend on nothing else.
 function walkFrom(start) {
-  const scene = sceneNow(), goal = Number($("x-goal").value), width = DATA.scenes[scene].actions.length;
-  const shares = slice(viewNow().probabilities, width), { next } = drawing(scene), way = [start];
-  for (let state = start; state !== goal && way.length <= agentNow().max_steps; ) {
-    let draw = Math.random(), action = 0;
-    while (action < width - 1 && (draw -= shares[state * width + action]) >= 0) action += 1;
-    way.push((state = next[state * width + action]));
-  }
-  at.own = way;
+  at.own = sampleWalk(drawing(sceneNow()), sharesNow(), widthNow(), start, goalNow(), agentNow().max_steps, 1000 + at.tries++);
+  at.yours = false;
   listWalks("own");
-  showWalk(way);
+  showWalk(at.own);
+}
+
+// One action of the reader's own, from where the agent stands.
+function drive(action) {
+  const { actions } = DATA.scenes[sceneNow()], index = actions.indexOf(action);
+  if (index < 0 || at.way[at.step] === goalNow()) return;
+  const way = at.way.slice(0, at.step + 1);
+  way.push(drawing(sceneNow()).next[way.at(-1) * actions.length + index]);
+  at.own = way;
+  at.yours = true;
+  listWalks("own");
+  showWalk(way, way.length - 1);
+}
+
+// Those of the file, or sampled here: the same ones whenever the page is opened.
+function walksNow() {
+  const view = viewNow(), goal = goalNow(), row = DATA.goals[sceneNow()].indexOf(goal);
+  if (view.walks) return view.walks[row];
+  return view.starts[row].map((start, i) => sampleWalk(drawing(sceneNow()), sharesNow(), widthNow(), start, goal, agentNow().max_steps, i));
 }
 
 function listWalks(chosen = 0) {
-  const ways = viewNow().walks[goalIndex()], goal = Number($("x-goal").value);
-  const name = (way, i) => [i, `${i + 1}: ${way.length - 1} actions${way.at(-1) === goal ? "" : ", failed"}`];
-  fill($("x-walk"), [...ways.map(name), ...(at.own ? [["own", "from the pose that you chose"]] : [])], chosen);
+  const goal = goalNow();
+  const name = (way, i) => [i, `${i + 1}: ${plural(way.length - 1, "action")}${way.at(-1) === goal ? "" : ", failed"}`];
+  fill($("x-walk"), [...at.walks.map(name), ...(at.own ? [["own", at.yours ? "yours" : "from the pose that you chose"]] : [])], chosen);
 }
 
 function chooseGoal() {
   at.own = null;
+  at.tries = 0;
+  at.walks = walksNow();
+  at.way = at.walks[0] || [goalNow()];
+  at.step = 0;
   listWalks();
   paintExplorer();
-  showWalk(viewNow().walks[goalIndex()][0] || [Number($("x-goal").value)]);
+  showWalk(at.way);
   $("x-again").disabled = !agentNow().markov;
 }
 
-function listGoals(wanted) {
-  const agent = agentNow(), scene = sceneNow(), before = wanted ?? Number($("x-goal").value);
+// Success of each goal, of this agent's model, where it was measured.
+function successOf(agent, scene) {
   const row = DATA.maps.find((item) => item.model === agent.model && item.scene === scene);
-  const hardest = row && row[DATA.hardest] && DATA.hardest;
+  return row && row[DATA.hardest] ? unpack(row[DATA.hardest]) : null;
+}
+
+// How often a goal is reached: computed where the page can, else whether its first episode arrives.
+function reached(goal) {
+  if (agentNow().markov) return meanOverStarts(arrivalNow(goal), actionsToGo(sceneNow(), goal));
+  const way = viewNow().walks[DATA.goals[sceneNow()].indexOf(goal)][0];
+  return way && way.at(-1) === goal ? 1 : 0;
+}
+
+const TRIED = 12; // goals that are computed to find a good or a bad one
+
+// The goals in an order, best first: trained ones, then those with most success.
+function ranked() {
+  const agent = agentNow(), scene = sceneNow(), success = successOf(agent, scene), trained = agent.trained[scene] || [];
+  const rank = (goal) => (trained.includes(goal) ? 2 : 0) + (success && known(success[goal]) ? success[goal] : 0.5);
+  return [...DATA.goals[scene]].sort((a, b) => rank(b) - rank(a));
+}
+
+function bestGoal() {
+  let best = null;
+  for (const goal of ranked().slice(0, TRIED)) {
+    const share = reached(goal);
+    if (share > 0.9) return { goal, share };
+    if (!best || share > best.share) best = { goal, share };
+  }
+  return best;
+}
+
+function worstGoal() {
+  let worst = null;
+  for (const goal of ranked().reverse().slice(0, TRIED)) {
+    const share = reached(goal);
+    if (!worst || share < worst.share) worst = { goal, share };
+  }
+  return worst;
+}
+
+function listGoals(wanted) {
+  const agent = agentNow(), scene = sceneNow(), success = successOf(agent, scene), before = wanted ?? goalNow();
   fill($("x-goal"), DATA.goals[scene].map((goal) => {
     const trained = agent.trained[scene]?.includes(goal) ? " · trained" : "";
-    const success = hardest ? ` · ${percent(unpack(row[hardest])[goal])} ${headOf(hardest)}` : "";
-    return [goal, `${goal}${trained}${success}`];
-  }), before);
+    return [goal, `${goal}${trained}${success ? ` · ${percent(success[goal])} ${headOf(DATA.hardest)}` : ""}`];
+  }), at.listed === scene || wanted !== undefined ? before : undefined);
+  if (at.listed !== scene && wanted === undefined) $("x-goal").value = bestGoal().goal;
+  at.listed = scene;
   chooseGoal();
 }
 
 function chooseScene(wanted) {
-  const scene = sceneNow();
+  const scene = sceneNow(), plan = DATA.scenes[scene];
   if (at.mapScene !== scene) {
-    const host = make("div", { class: "floor", id: "x-map" });
+    const host = make("div", { class: "floor", id: "x-map", tabindex: 0, role: "application", "aria-label": `Map of ${scene}: arrow keys move the agent` });
     $("x-map").replaceWith(host); // with its listeners
-    at.map = floorMap(host, scene, `Map of ${words(scene)}`);
+    at.map = floorMap(host, scene, `Map of ${scene}`);
     at.mapScene = scene;
     at.map.listen(
       (state, event) => {
-        const width = DATA.scenes[scene].actions.length, shares = slice(viewNow().probabilities, width), action = likeliest(shares, state, width);
-        const does = `${DATA.scenes[scene].actions[action].replace(/(?<=[a-z])(?=[A-Z])/g, " ").toLowerCase()} ${percent(shares[state * width + action])}`;
-        const value = at.layer.values[state];
+        const width = widthNow(), shares = sharesNow(), action = likeliest(shares, state, width), value = at.layer.values[state];
+        const does = `${inWords(plan.actions[action])} ${percent(shares[state * width + action])}`;
         tell(event, ...tipOf(scene, state, `state ${state}: ${Number.isFinite(value) ? at.layer.words(value) : "–"} ${at.layer.unit}`, does));
       },
-      (state) => { if (agentNow().markov && state !== Number($("x-goal").value)) walkFrom(state); },
+      (state) => { if (agentNow().markov && state !== goalNow()) { walkFrom(state); writeLink(); } },
     );
+    $("x-ground-label").hidden = !plan.room && !plan.edges?.length;
+    $("x-ground-label").querySelector("span").textContent = plan.room ? "walls and furniture" : "blocked steps";
   }
   listGoals(wanted);
 }
 
 function chooseAgent(wanted) {
-  const agent = agentNow(), scenes = Object.keys(agent.scenes), before = $("x-layer").value, explained = agent.scenes[scenes[0]].explained;
-  fill($("x-scene"), scenes.map((name) => [name, words(name)]), sceneNow());
-  const components = explained ? explained.map((_, i) => [`psi${i}`, `ψ, component ${i + 1}`]) : [];
-  fill($("x-layer"), [["value", "value"], ...components, ["sure", "probability of the most probable action"], ["togo", "shortest path"]], before || "value");
+  const agent = agentNow(), scenes = Object.keys(agent.scenes), before = $("x-layer").value;
+  fill($("x-scene"), scenes.map((name) => [name, name]), sceneNow());
   $("x-note").textContent = [
-    agent.markov ? "Click a pose on the map to start the agent there. Such episodes are sampled in this page from the policy's probabilities." : `This agent ${agent.history > 1 ? `sees its last ${agent.history} frames` : "has a memory"}; map and bars show its policy at the beginning of an episode.`,
-    explained ? "" : `${agent.model} has no ψ.`,
+    agent.markov ? "Click a pose on the map to start the agent there. Episodes are sampled in this page from the policy's probabilities." : `This agent ${agent.history > 1 ? `sees its last ${agent.history} frames` : "has a memory"}; map and bars show its policy at the beginning of an episode.`,
+    agent.scenes[scenes[0]].explained ? "" : `${agent.model} has no ψ.`,
   ].join(" ");
+  listLayers(before);
   chooseScene(wanted);
-  sayShares();
 }
 
-function sayShares() {
+function listLayers(before) {
   const { explained } = viewNow();
-  const shares = explained ? ` The components explain ${explained.map((share) => percent(share)).join(", ")} of the variance of ψ over these goals.` : "";
-  $("x-caption").textContent = `Orange: the goal. White: the agent. Arrows: the most probable action, fainter where its probability is lower; sideways arrows are turns.${shares}`;
+  const components = (explained || []).map((share, i) => [`psi${i}`, `ψ, principal component ${i + 1} (${percent(share)} of its variance)`]);
+  const computed = agentNow().markov ? [["occupancy", "expected occupancy"], ["arrive", "probability of arriving"]] : [];
+  fill($("x-layer"), [["value", "value"], ...computed, ...components, ["sure", "probability of the most probable action"], ["togo", "shortest path"]], before || "value");
 }
 
-function openGoal(label, scene, goal, event) {
+// The goal on this page whose pose is nearest to a state.
+function nearestGoal(scene, state) {
+  const { x, y, heading } = DATA.scenes[scene];
+  const turn = (goal) => Math.abs(((heading[goal] - heading[state] + 540) % 360) - 180) / 180;
+  const far = (goal) => Math.hypot(x[goal] - x[state], y[goal] - y[state]) + 0.5 * turn(goal);
+  return DATA.goals[scene].reduce((best, goal) => (far(goal) < far(best) ? goal : best));
+}
+
+function notice(text) {
+  $("x-notice").textContent = text;
+  $("x-notice").hidden = !text;
+}
+
+function openGoal(label, scene, wanted) {
   const index = DATA.agents.findIndex((agent) => agent.model === label && agent.scenes[scene]);
   const found = index >= 0 ? index : DATA.agents.findIndex((agent) => agent.scenes[scene]);
-  if (found < 0 || !DATA.goals[scene].includes(goal)) return tell(event, `The explorer has ${DATA.goals[scene].length} goals of this scene; goal ${goal} is not among them.`);
+  if (found < 0) return;
   hush();
-  $("x-agent").value = found;
-  fill($("x-scene"), Object.keys(agentNow().scenes).map((name) => [name, words(name)]));
+  const goal = DATA.goals[scene].includes(wanted) ? wanted : nearestGoal(scene, wanted);
+  const others = [index < 0 ? `${label} is not in the explorer; this is ${DATA.agents[found].name}.` : "", goal === wanted ? "" : `To keep the page small, it has ${DATA.goals[scene].length} of the ${DATA.scenes[scene].states} goals of ${scene}; this is goal ${goal}, the nearest one to ${wanted}.`];
+  show({ agent: found, scene, goal });
+  notice(others.filter(Boolean).join(" "));
+  writeLink();
+  $("explorer").scrollIntoView();
+}
+
+function show({ agent, scene, goal }) {
+  $("x-agent").value = agent;
+  fill($("x-scene"), Object.keys(agentNow().scenes).map((name) => [name, name]));
   $("x-scene").value = scene;
   chooseAgent(goal);
-  $("explorer").scrollIntoView();
 }
 
 function startExplorer() {
   $("explorer").hidden = !DATA.agents.length;
   if (!DATA.agents.length) return;
-  const most = Math.max(...Object.values(DATA.goals).map((goals) => goals.length));
-  $("explorer-say").textContent = `Choose a model, a scene and a goal. The map shows the value of every pose for that goal and the most probable action there, the pictures what the agent sees. Each scene has up to ${most} goals: trained ones, those reached least, and some spread over the room.`;
-  fill($("x-agent"), DATA.agents.map((agent, i) => [i, `${agent.name}`]));
-  $("x-agent").addEventListener("change", () => chooseAgent());
-  $("x-scene").addEventListener("change", () => { chooseScene(); sayShares(); });
-  $("x-goal").addEventListener("change", chooseGoal);
-  $("x-layer").addEventListener("change", paintExplorer);
+  $("explorer-say").textContent = "Choose a model, a scene and a goal. The map shows what the agent makes of every pose on its way to that goal, and the most probable action there; the pictures show what it sees.";
+  $("x-caption").textContent = "Orange: the goal. White: the agent. Arrows: the most probable action, fainter where its probability is lower; sideways arrows are turns.";
+  fill($("x-agent"), DATA.agents.map((agent, i) => [i, agent.name]));
+  const also = (choose) => () => { notice(""); guideTo(0); choose(); writeLink(); };
+  $("x-agent").addEventListener("change", also(() => chooseAgent()));
+  $("x-scene").addEventListener("change", also(() => { listLayers($("x-layer").value); chooseScene(); }));
+  $("x-goal").addEventListener("change", also(chooseGoal));
+  $("x-layer").addEventListener("change", also(paintExplorer));
   $("x-arrows").addEventListener("change", drawArrows);
-  $("x-walk").addEventListener("change", () => showWalk($("x-walk").value === "own" ? at.own : viewNow().walks[goalIndex()][Number($("x-walk").value)]));
+  $("x-ground").addEventListener("change", () => $("x-map-host").classList.toggle("no-ground", !$("x-ground").checked));
+  $("x-walk").addEventListener("change", () => showWalk($("x-walk").value === "own" ? at.own : at.walks[Number($("x-walk").value)]));
   $("x-step").addEventListener("input", () => { pause(); at.step = Number($("x-step").value); drawWalk(); });
   $("x-play").addEventListener("click", play);
-  $("x-again").addEventListener("click", () => walkFrom(at.way[at.step] === Number($("x-goal").value) ? at.way[0] : at.way[at.step]));
+  $("x-again").addEventListener("click", () => walkFrom(at.way[at.step] === goalNow() ? at.way[0] : at.way[at.step]));
+  redraws.push(paintExplorer);
   chooseAgent();
+  startGuide();
+  startKeys();
+  addEventListener("hashchange", readLink);
 }

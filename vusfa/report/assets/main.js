@@ -8,7 +8,6 @@ function setTheme(name) {
 
 function introduce() {
   const strong = (text) => make("strong", {}, text);
-  const plural = (count, word) => `${count} ${word}${count === 1 ? "" : "s"}`;
   const scenes = Object.values(DATA.scenes), states = scenes.reduce((sum, scene) => sum + scene.states, 0);
   const runs = DATA.tables.runs.length;
   $("lede").replaceChildren(
@@ -17,10 +16,14 @@ function introduce() {
   );
   const { vusfa, torch, python } = DATA.versions;
   const places = [...new Set(DATA.tables.runs.map((row) => row.scenes))];
-  const said = [places.length === 1 && places[0] ? `All runs are in: ${words(places[0])}. ` : "", `Made by vusfa ${vusfa} with PyTorch ${torch} and Python ${python}`, DATA.command ? `, with: ${DATA.command}` : "", "."];
-  const shown = Math.max(0, ...Object.values(DATA.goals).map((goals) => goals.length));
-  said.push(` To keep the page small, values and components of ψ are rounded to 255 levels, pictures are scaled down, and the explorer has at most ${shown} goals per scene`);
-  said.push(DATA.goals_limit < DATA.goals_asked ? ` (${DATA.goals_asked} were requested).` : ".");
+  const said = [places.length === 1 && places[0] ? `All runs are in: ${places[0]}. ` : "", `Made by vusfa ${vusfa} with PyTorch ${torch} and Python ${python}`, DATA.command ? `, with: ${DATA.command}` : "", "."];
+  said.push(" To keep the page small, pictures are scaled down");
+  if (DATA.agents.length) {
+    const every = Object.keys(DATA.agents[0].scenes).every((name) => DATA.goals[name].length === DATA.scenes[name].states);
+    said.push(", values and components of ψ are rounded to 255 levels", every ? "; the explorer has every state as a goal" : `, and the explorer has at most ${DATA.goals_limit} goals per scene`);
+    if (!every && DATA.goals_limit < DATA.goals_asked) said.push(` (of ${DATA.goals_asked}; more megabytes give more)`);
+  }
+  said.push(".");
   const pictures = scenes.reduce((sum, scene) => sum + scene.pictures.ids.length, 0);
   if (pictures && pictures < states) said.push(` It has pictures of ${grouped(pictures)} of the ${grouped(states)} poses.`);
   said.push(" The tables are beside this page as CSV, unrounded.", ...DATA.notes.map((note) => ` ${note}`));
@@ -44,4 +47,5 @@ startExplorer();
 watchSections();
 $("theme").addEventListener("click", () => setTheme(theme() === "dark" ? "light" : "dark"));
 setTheme(theme());
+if (DATA.agents.length) readLink();
 document.documentElement.dataset.ready = "yes";
