@@ -17,7 +17,7 @@ import vusfa
 from vusfa.cli.app import app
 from vusfa.deploy import Navigator, open_agent, pretrained_names
 from vusfa.deploy.agents import PRETRAINED, read_agent, rounded, save_agent
-from vusfa.deploy.cards import TOLERANCE, card_head, make_pretrained
+from vusfa.deploy.cards import TOLERANCE, card_head, make_pretrained, write_log
 from vusfa.errors import CheckpointError, ConfigError, ResultError
 from vusfa.evaluation import Episodes
 from vusfa.evaluation.exact import exact_goals, expected_walks
@@ -43,7 +43,7 @@ def command() -> Callable[..., Any]:
 def test_the_four_models_are_there_and_small() -> None:
     assert set(NAMES) <= set(pretrained_names())
     assert sum(path.stat().st_size for path in PRETRAINED.iterdir()) < 15e6
-    assert {path.suffix for path in PRETRAINED.iterdir()} == {".safetensors", ".md"}
+    assert {path.suffix for path in PRETRAINED.iterdir()} == {".safetensors", ".md", ".csv"}
 
 
 @pytest.mark.parametrize("name", pretrained_names())
@@ -236,3 +236,26 @@ def test_damaged_files_and_files_of_others_are_one_error(world: Any, tmp_path: P
         open_agent(bad)
     with pytest.raises(CheckpointError, match="no such file; vusfa pretrained list"):
         open_agent(tmp_path / "none.safetensors")
+
+
+def test_a_learning_curve_ends_with_its_checkpoint(tmp_path: Path) -> None:
+    log = tmp_path / "metrics.csv"
+    rows = [f"{100 * k},{k / 1000},,0.5" for k in range(1, 501)]
+    log.write_text("\n".join(["frames,success,entropy,goal/hall/3/success", *rows]))
+    kept = write_log(log, tmp_path / "agent.csv", 40_000).read_text().splitlines()
+    assert kept[0] == "frames,success"
+    assert len(kept) == 121
+    assert kept[1].startswith("100.0,0.001")
+    assert kept[-1] == "40000.0,0.4"
+    log.write_text("success\n0.5\n")
+    with pytest.raises(ResultError, match="column 'frames' is missing"):
+        write_log(log, tmp_path / "none.csv", 1)
+    assert not (tmp_path / "none.csv").exists()
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_learning_curve_is_that_of_the_agent(name: str) -> None:
+    frames = [float(line.split(",")[0]) for line in (PRETRAINED / f"{name}.csv").read_text().splitlines()[1:]]
+    facts = card_head((PRETRAINED / f"{name}.md").read_text())["vusfa"]
+    assert frames == sorted(frames)
+    assert frames[-1] == facts["frames"]

@@ -11,6 +11,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pandas as pd
 import torch
 import yaml
@@ -21,16 +22,18 @@ from vusfa.evaluation.exact import ExactGoals, exact_goals, uniform_probabilitie
 from vusfa.evaluation.long_table import SUBSETS, exact_rows, goal_sums, select_goals
 from vusfa.evaluation.statistics import bootstrap_mean
 from vusfa.experiments.runs import Run, read_run
-from vusfa.files import check_folder, replacing
+from vusfa.files import check_folder, replacing, write_csv
 from vusfa.modules import TabularPolicy
+from vusfa.reading import read_csv
 from vusfa.scenes import SceneSet
 from vusfa.training import load_agent
 
-__all__ = ["TOLERANCE", "card_head", "make_pretrained", "numbers"]
+__all__ = ["TOLERANCE", "card_head", "make_pretrained", "numbers", "write_log"]
 
 #: How far a mean of the rounded agent may be from its cell's, success and SPL in 0..1.
 TOLERANCE = 0.005
 METRICS = ("success_500", "success_100", "spl")
+_LOGGED = 120  # rows of a learning curve
 _HEAD = re.compile(r"\A---\n(.*?)\n---\n", re.DOTALL)
 
 
@@ -78,7 +81,8 @@ def numbers(exact: ExactGoals, scenes: SceneSet, trained: torch.Tensor) -> dict[
 
 
 def make_pretrained(cell: Path, runs: Path, commit: str, out: Path = PRETRAINED) -> Path:
-    """Write NAME.safetensors and its model card NAME.md from a result cell and its checkpoint.
+    """Write NAME.safetensors, its model card NAME.md and its learning curve NAME.csv from a result cell and the
+    training's checkpoint and log.
 
     Args:
         cell: folder of the results, RESULTS/EXPERIMENT/RUN, such as ``results/table1/vusfa-0``.
@@ -128,7 +132,33 @@ def make_pretrained(cell: Path, runs: Path, commit: str, out: Path = PRETRAINED)
         text = _card(label, run, state["goals"], wanted, worst, commit, unfinished.stat().st_size)
         with replacing(target.with_suffix(".md")) as card:
             card.write_text(text, encoding="utf-8")
+    log = checkpoint.with_name("metrics.csv")
+    if log.is_file():
+        write_log(log, target.with_suffix(".csv"), state["frames"])
     return target
+
+
+def write_log(log: Path, out: Path, frames: int) -> Path:
+    """Write at most 120 rows of a training's metrics.csv, spread evenly, without the columns per goal.
+
+    Args:
+        log: the file.
+        out: file to write.
+        frames: of the checkpoint; later rows are left out.
+
+    Raises:
+        ResultError: the log is damaged.
+    """
+    columns = read_csv(log, ResultError, "give the log of a run of vusfa train")
+    if "frames" not in columns:
+        raise ResultError(f"{log}: column 'frames' is missing; give the log of a run of vusfa train")
+    rows = np.flatnonzero(columns["frames"] <= frames)
+    rows = rows[np.unique(np.linspace(0, len(rows) - 1, min(len(rows), _LOGGED)).round().astype(int))]
+    names = [name for name in columns if not name.startswith("goal/") and np.isfinite(columns[name]).any()]
+    digits = {name: ".0f" if name == "frames" else ".4g" for name in names}
+    return write_csv(
+        out, [{n: float(f"{columns[n][row]:{digits[n]}}") for n in names} for row in rows], names
+    )
 
 
 def _deviation(found: TrainedAgent, wanted: Mapping[str, Mapping[str, list[float]]]) -> float:
