@@ -34,7 +34,7 @@ def commands(folder: Path) -> list[list[str]]:
     run = folder / "run"
     title = ["--title", "Table 1 and hindsight"]
     return [
-        [*vusfa, "report", *RESULTS, "--seeds", "1", *title, "--out", str(folder / "results.html")],
+        [*vusfa, "report", *RESULTS, "--megabytes", "25", *title, "--out", str(folder / "results.html")],
         [*vusfa, "train", *TRAINING.split(), f"folder={run}", "overwrite=true"],
         [
             *vusfa,

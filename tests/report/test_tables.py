@@ -12,7 +12,7 @@ import torch
 from vusfa.evaluation.exact import ExactGoals
 from vusfa.report.by_goal import distance_rows, goal_rows
 from vusfa.report.runs import LoggedRun
-from vusfa.report.tables import over_seeds, reference_rows, run_rows, seed_rows, summary_rows
+from vusfa.report.tables import baseline_rows, over_seeds, reference_rows, run_rows, seed_rows, summary_rows
 from vusfa.scenes import Scene, SceneSet
 
 # goal, start, success, length, shortest, collisions, trained
@@ -127,3 +127,27 @@ def test_the_runs_themselves(two_seeds: list[LoggedRun]):
     assert (row["trained_success"], row["unseen_success"], row["evaluated"]) == (0.5, 1.0, "sampled")
     assert (last["folder"], last["evaluated"], last["scenes"]) == ("x", "no", "hall")
     assert math.isnan(last["frames"])
+
+
+def test_baselines_are_computed_once_per_set_of_goals(
+    two_seeds: list[LoggedRun], corridor: SceneSet, monkeypatch: pytest.MonkeyPatch
+):
+    """The tables show the first row of each name, goals and scene: more runs add none."""
+    asked: list[LoggedRun] = []
+    computed = reference_rows
+
+    def counted(run: LoggedRun, *rest: object) -> list[dict[str, object]]:
+        asked.append(run)
+        return computed(run, *rest)  # type: ignore[arg-type]
+
+    monkeypatch.setattr("vusfa.report.tables.reference_rows", counted)
+    rows = baseline_rows(two_seeds, corridor, [50])
+    assert asked == two_seeds[:1]
+    every = [row for run in two_seeds for row in computed(run, corridor, [50])]
+    assert str(summary_rows(two_seeds, [50], rows)) == str(summary_rows(two_seeds, [50], every))
+    # goals that the first run has not are added
+    assert two_seeds[0].episodes is not None
+    part = two_seeds[0].episodes.select(two_seeds[0].episodes.trained)
+    asked.clear()
+    baseline_rows([dataclasses.replace(two_seeds[0], episodes=part), *two_seeds], corridor, [50])
+    assert len(asked) == 2

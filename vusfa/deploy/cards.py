@@ -81,8 +81,8 @@ def numbers(exact: ExactGoals, scenes: SceneSet, trained: torch.Tensor) -> dict[
 
 
 def make_pretrained(cell: Path, runs: Path, commit: str, out: Path = PRETRAINED) -> Path:
-    """Write NAME.safetensors, its model card NAME.md and its learning curve NAME.csv from a result cell and the
-    training's checkpoint and log.
+    """Write NAME.safetensors, its model card NAME.md and, where the training's log lies beside its checkpoint,
+    its learning curve NAME.csv.
 
     Args:
         cell: folder of the results, RESULTS/EXPERIMENT/RUN, such as ``results/table1/vusfa-0``.
@@ -156,9 +156,8 @@ def write_log(log: Path, out: Path, frames: int) -> Path:
     rows = rows[np.unique(np.linspace(0, len(rows) - 1, min(len(rows), _LOGGED)).round().astype(int))]
     names = [name for name in columns if not name.startswith("goal/") and np.isfinite(columns[name]).any()]
     digits = {name: ".0f" if name == "frames" else ".4g" for name in names}
-    return write_csv(
-        out, [{n: float(f"{columns[n][row]:{digits[n]}}") for n in names} for row in rows], names
-    )
+    kept = [{name: float(format(columns[name][row], digits[name])) for name in names} for row in rows]
+    return write_csv(out, kept, names)
 
 
 def _deviation(found: TrainedAgent, wanted: Mapping[str, Mapping[str, list[float]]]) -> float:

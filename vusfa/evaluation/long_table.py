@@ -105,7 +105,6 @@ def exact_rows(
         exact: of all goals.
         goals: rows with scene, goal and trained: the goals to keep.
         scenes: names, by their index in ``exact``.
-        model, run, seed: columns.
     """
     size = 1 + int(max(exact.goal.max(), goals.goal.max()))
     place = torch.full((len(scenes) * size,), -1)
@@ -216,7 +215,6 @@ def average_over_scenes(table: pd.DataFrame, by: Sequence[str]) -> pd.DataFrame:
     """:func:`pool` per scene and, where there are several scenes, both averages over them.
 
     The mean of scenes averages the values of the scenes that have one; the mean of states pools all goals.
-    The paper's own table mixes the two.
 
     Args:
         table: long.
@@ -236,7 +234,6 @@ def goal_sums(tables: Sequence[pd.DataFrame], metric: str) -> tuple[Sums, Tensor
 
     Args:
         tables: K long tables, one per seed, each of one mode.
-        metric: its name.
 
     Returns:
         sums (K, G) and the number (G,) of each goal's scene; None where there are no goals, or the seeds have
@@ -250,8 +247,8 @@ def goal_sums(tables: Sequence[pd.DataFrame], metric: str) -> tuple[Sums, Tensor
     scenes, goals, over, under = zip(*parts, strict=True) if parts else ([()],) * 4
     if not len(scenes[0]) or any(not np.array_equal(x, of[0]) for of in (goals, scenes) for x in of):
         return None
-    sums = Sums(torch.tensor(np.stack(over)), torch.tensor(np.stack(under)))
-    return sums, torch.tensor(pd.factorize(scenes[0])[0])
+    over, under = (torch.tensor(np.stack(rows)) for rows in (over, under))
+    return Sums(over, under), torch.tensor(pd.factorize(scenes[0])[0])
 
 
 def distance_to_trained(scenes: SceneSet, scene: Tensor, goal: Tensor, trained: Tensor) -> Tensor:
