@@ -81,8 +81,8 @@ def numbers(exact: ExactGoals, scenes: SceneSet, trained: torch.Tensor) -> dict[
 
 
 def make_pretrained(cell: Path, runs: Path, commit: str, out: Path = PRETRAINED) -> Path:
-    """Write NAME.safetensors, its model card NAME.md and, where the training's log lies beside its checkpoint,
-    its learning curve NAME.csv.
+    """Write NAME.safetensors, its model card NAME.md and, where the training's log lies beside its
+    checkpoint, its learning curve NAME.csv.
 
     Args:
         cell: folder of the results, RESULTS/EXPERIMENT/RUN, such as ``results/table1/vusfa-0``.

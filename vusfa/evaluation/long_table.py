@@ -247,8 +247,8 @@ def goal_sums(tables: Sequence[pd.DataFrame], metric: str) -> tuple[Sums, Tensor
     scenes, goals, over, under = zip(*parts, strict=True) if parts else ([()],) * 4
     if not len(scenes[0]) or any(not np.array_equal(x, of[0]) for of in (goals, scenes) for x in of):
         return None
-    over, under = (torch.tensor(np.stack(rows)) for rows in (over, under))
-    return Sums(over, under), torch.tensor(pd.factorize(scenes[0])[0])
+    sums = Sums(*(torch.tensor(np.stack(part)) for part in (over, under)))
+    return sums, torch.tensor(pd.factorize(scenes[0])[0])
 
 
 def distance_to_trained(scenes: SceneSet, scene: Tensor, goal: Tensor, trained: Tensor) -> Tensor:
@@ -256,8 +256,7 @@ def distance_to_trained(scenes: SceneSet, scene: Tensor, goal: Tensor, trained: 
 
     Args:
         scenes: the world.
-        scene, goal: (G,) int64.
-        trained: (G,) bool.
+        scene, goal, trained: (G,) int64, int64 and bool.
 
     >>> bathroom, goals = SceneSet.bundled(["bathroom"]), torch.arange(4)
     >>> distance_to_trained(bathroom, goals * 0, goals, goals == 0).tolist()
