@@ -20,10 +20,10 @@ from sphinx.util import logging
 __all__ = ["commands", "setup"]
 
 ROOT = Path(__file__).parents[2]
-RESULTS = ["results/table1", "results/hindsight"]
+RESULTS = ["results/table1", "results/hindsight", "results/replay-search"]
 SOURCES = {".py", ".js", ".css", ".html", ".yaml"}
 TRAINING = (
-    "preset=hindsight scenes=[bathroom] total_frames=40000"
+    "preset=replay_search scenes=[bathroom] total_frames=40000"
     " agent.hidden_size=128 agent.embedding_size=64 evaluation=all"
 )
 
@@ -32,14 +32,14 @@ def commands(folder: Path) -> list[list[str]]:
     """The commands that write results.html and explorer.html into a folder."""
     vusfa = [sys.executable, "-m", "vusfa.cli"]
     run = folder / "run"
-    title = ["--title", "Table 1 and hindsight"]
+    title = ["--title", "Table 1 and every goal"]
     return [
         [*vusfa, "report", *RESULTS, "--megabytes", "25", *title, "--out", str(folder / "results.html")],
         [*vusfa, "train", *TRAINING.split(), f"folder={run}", "overwrite=true"],
         [
             *vusfa,
             "report",
-            f"VUSFA with hindsight={run}",
+            f"VUSFA + replay search={run}",
             *("--title", "One agent in the bathroom", "--out", str(folder / "explorer.html")),
         ],
     ]

@@ -62,6 +62,19 @@ def test_episodes_go_to_the_trained_goals_alone(scene_file: Path) -> None:
     assert one.algorithm.replay_steps == 9
 
 
+@pytest.mark.parametrize(("frames", "starts"), [(260_000, 100_000), (1_000_000, 100_000), (500, 200)])
+def test_a_search_begins_after_a_part_of_the_training(scene_file: Path, frames: int, starts: int) -> None:
+    """And does not stop where a resumed training is given more frames."""
+    algorithm = trainer(scene_file, f"total_frames={frames}", "algorithm.learning_starts=null").algorithm
+    for now, steps in ((0, 0), (starts - 1, 0), (starts, 9), (starts - 1, 9)):
+        algorithm.schedule(now)
+        assert algorithm.replay_steps == steps
+    longer = trainer(scene_file, "algorithm.learning_starts=250000").algorithm
+    longer.load_state_dict(algorithm.state_dict())
+    longer.schedule(starts)
+    assert longer.replay_steps == 9
+
+
 @pytest.mark.parametrize(
     ("override", "message"),
     [
@@ -69,7 +82,8 @@ def test_episodes_go_to_the_trained_goals_alone(scene_file: Path) -> None:
         ("algorithm.num_goals=0", "algorithm.num_goals is 0; give 1 or more"),
         ("algorithm.batch_size=7", "batch_size is 7 for 8 goals"),
         ("algorithm.path_share=1.5", "path_share is 1.5"),
-        ("algorithm.learning_starts=-1", "learning_starts -1"),
+        ("algorithm.learning_starts=-1", "learning_starts is -1 of total_frames 260000: nothing would be"),
+        ("algorithm.learning_starts=260000", "learning_starts is 260000 of total_frames 260000"),
         ("agent.history=2", "agent.history=1"),
         ("agent=lstm", "agent.memory=null"),
         ("agent.observation=features", "agent.observation=index"),

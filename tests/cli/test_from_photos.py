@@ -80,7 +80,7 @@ def test_a_bundled_room_comes_out_of_its_photographs(
     result = run("from-photos", flat, "--features", features, *options)
     assert result.exit_code == 0, result.output
     assert result.stdout == "flat.h5: 176 states, a grid of 0.5 m, headings 90 degrees apart\n"
-    assert result.stderr.startswith("next: vusfa scenes show flat.h5; vusfa train preset=hindsight")
+    assert result.stderr.startswith("next: vusfa scenes show flat.h5; vusfa train preset=replay_search")
     assert validate("flat.h5") == []
     scene = Scene.load("flat.h5")
     assert scene.name == "flat"

@@ -110,10 +110,10 @@ def test_help_of_a_function_shows_its_examples(line: list[str], monkeypatch: pyt
 
 def test_the_program_begins_with_first_steps() -> None:
     text = CliRunner().invoke(app, ["--help"], env={"COLUMNS": "120"}).output
-    assert "vusfa train preset=hindsight" in text.partition("First steps:")[2]
+    assert "vusfa train preset=replay_search" in text.partition("First steps:")[2]
 
 
-@pytest.mark.parametrize("word", ["--seed", "--preset=hindsight", "--total-frames"])
+@pytest.mark.parametrize("word", ["--seed", "--preset=replay_search", "--total-frames"])
 def test_train_says_how_settings_are_written(word: str) -> None:
     done = CliRunner().invoke(app, ["train", word])
     assert done.exit_code == 2

@@ -46,5 +46,9 @@ def test_a_mistake_is_one_line(tmp_path: Path):
 def test_help_lists_settings_and_choices(tmp_path: Path):
     text = vusfa("train", "--help", folder=tmp_path).stdout
     assert text.lstrip().startswith("vusfa train SETTING=VALUE")
-    for words in ("algorithm: autoencoder, hindsight, usf", "total_frames: 6000000", "--multirun"):
+    for words in (
+        "algorithm: autoencoder, hindsight, replay_search, usf",
+        "total_frames: 6000000",
+        "--multirun",
+    ):
         assert words in text

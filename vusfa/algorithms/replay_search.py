@@ -21,6 +21,9 @@ from vusfa.scenes import SceneSet
 
 __all__ = ["ReplaySearch", "ReplaySearchSettings"]
 
+#: Frames of walking before the first search, at most, where settings give none.
+MAX_START = 100_000
+
 
 @dataclass
 class ReplaySearchSettings(AlgorithmSettings):
@@ -31,8 +34,9 @@ class ReplaySearchSettings(AlgorithmSettings):
         batch_size: pairs of a state and a goal in each of these steps.
         num_goals: goals among these pairs.
         path_share: share of the states that are drawn as walks to the goal pass them, the others uniformly.
-        learning_starts: frames of walking before the first search. A policy that has learned shortest paths
-            tries nothing else, so every action should have been tried by then.
+        learning_starts: frames of walking before the first search; None: 40 % of ``total_frames``, at most
+            100,000. A policy that has learned shortest paths tries nothing else, so every action should have
+            been tried by then.
         critic_coeff, objective_coeff: of :class:`~vusfa.objectives.SearchLoss`.
     """
 
@@ -40,7 +44,7 @@ class ReplaySearchSettings(AlgorithmSettings):
     batch_size: int = 8192
     num_goals: int = 32
     path_share: float = 0.5
-    learning_starts: int = 100_000
+    learning_starts: int | None = None
     critic_coeff: float = 1.0
     objective_coeff: float = 1.0
 
@@ -66,10 +70,16 @@ class ReplaySearch(USF):
                 f"algorithm.batch_size is {numbers['batch_size']} for {numbers['num_goals']} goals; give one"
                 " pair per goal or more"
             )
-        if not 0 <= numbers["path_share"] <= 1 or numbers["learning_starts"] < 0:
+        if not 0 <= numbers["path_share"] <= 1:
             raise ConfigError(
-                f"algorithm.path_share is {numbers['path_share']} and algorithm.learning_starts"
-                f" {numbers['learning_starts']}; give a number between 0 and 1, and 0 or more"
+                f"algorithm.path_share is {numbers['path_share']}; give a number between 0 and 1"
+            )
+        starts, total = numbers["learning_starts"], settings["total_frames"]
+        self._starts = min(MAX_START, int(0.4 * total)) if starts is None else starts
+        if not 0 <= self._starts < total:
+            raise ConfigError(
+                f"algorithm.learning_starts is {starts} of total_frames {total}: nothing would be learned"
+                " from the search; give fewer, 0 or more, or null"
             )
         if agent.config["observation"] != "index" or agent.config["memory"] or agent.config["history"] != 1:
             raise ConfigError(
@@ -82,6 +92,7 @@ class ReplaySearch(USF):
                 "optim.kind=a3c_rmsprop makes an update per environment of a batch, and pairs of states and"
                 " goals have none; give optim=adam, or algorithm=usf"
             )
+        self._searches = False
         self.graph = ExperienceGraph(scenes.num_states, scenes.num_actions)
         actor, critic = agent.get_policy_operator(), agent.get_value_operator()
         rewards = {name: settings["env"][name] for name in ("goal_reward", "step_reward")}
@@ -100,11 +111,10 @@ class ReplaySearch(USF):
         self.search_loss.to(next(agent.parameters()).device)
 
     def schedule(self, frames: int) -> None:
-        """Begin to search after ``learning_starts``."""
+        """Begin to search after ``learning_starts``, once and for all."""
         super().schedule(frames)
-        begun = frames >= self._numbers["learning_starts"]
-        self.replay_steps = self._numbers["updates"] - 1 if begun else 0
-        self._searches = begun
+        self._searches = self._searches or frames >= self._starts
+        self.replay_steps = self._numbers["updates"] - 1 if self._searches else 0
 
     def scenes_on_record(self) -> Tensor:
         """Those of the graph."""
@@ -128,7 +138,7 @@ class ReplaySearch(USF):
 
     def state_dict(self) -> dict[str, Any]:
         """The loss's buffers, and the graph."""
-        return {**super().state_dict(), "experience": self.graph.state_dict()}
+        return {**super().state_dict(), "experience": self.graph.state_dict(), "searches": self._searches}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Continue with the graph; a ``CheckpointError`` where the state has none."""
@@ -136,3 +146,4 @@ class ReplaySearch(USF):
         if not state.get("experience"):
             raise CheckpointError("of a training without replay_search; give algorithm=usf")
         self.graph.load_state_dict(state["experience"])
+        self._searches = bool(state["searches"])

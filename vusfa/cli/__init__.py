@@ -94,7 +94,7 @@ First steps:
 
     vusfa pretrained list
     vusfa film vusfa --scene kitchen
-    vusfa train preset=hindsight scenes=[bathroom] total_frames=50000 evaluation=all folder=runs/first
+    vusfa train preset=replay_search scenes=[bathroom] total_frames=50000 evaluation=all folder=runs/first
     vusfa report runs/first
 
 Settings and options are written name=value, options also --name value. Every --help has examples.

@@ -36,7 +36,7 @@ def check_target(target: Path, force: bool) -> None:
 def say_next(target: Path) -> None:
     """Print, on standard error, what can be done with a scene file that was made."""
     typer.echo(
-        f"next: vusfa scenes show {target}; vusfa train preset=hindsight scenes=[{target}]",
+        f"next: vusfa scenes show {target}; vusfa train preset=replay_search scenes=[{target}]",
         err=True,
     )
 

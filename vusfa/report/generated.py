@@ -29,16 +29,17 @@ COMMAND = "vusfa tables --docs docs/generated"
 
 Rows = Callable[[Experiment], list[dict[str, Any]]]
 
-_TABLE1 = ("table1", "hindsight")
+_TABLE1 = ("table1", "hindsight", "replay-search")
+_EVERY_GOAL = ("hindsight", "replay-search")
 _RUNS = ["model", "seed", "frames", "checkpoint", "training_s", "trained", "exact_z"]
 _MODELS = ["model", "seeds", "num_goals", "success_500", "success_100", "spl", "length_ratio"]
 _DISTANCE = ["distance", "model", "num_goals", "success_500", "spl"]
 _COMPARED = ["goals", "metric", "model", "against", "difference", "improvement"]
 
 
-def _models(*subsets: str) -> Rows:
+def _models(*subsets: str, mode: str = "sampled") -> Rows:
     def rows(experiment: Experiment) -> list[dict[str, Any]]:
-        found = model_rows(experiment, "sampled", places=[MEAN_OF_STATES], metrics=_MODELS[3:])
+        found = model_rows(experiment, mode, places=[MEAN_OF_STATES], metrics=_MODELS[3:])
         return [row for row in found if row["goals"] in subsets]
 
     return rows
@@ -69,7 +70,9 @@ TABLES: list[tuple[str, tuple[str, ...], Rows, list[str]]] = [
     ("controlled-runs", ("controlled",), run_rows, _RUNS[:-1]),
     ("presets", ("paper", "reference"), _models("trained", "unseen"), ["goals", *_MODELS]),
     ("other-baselines", ("autoencoder", "pixels", "lstm"), _models("trained", "unseen"), ["goals", *_MODELS]),
-    ("hindsight", ("hindsight",), _models("trained", "unseen", "all"), ["goals", *_MODELS]),
+    ("reach-every-goal", _EVERY_GOAL, _models("trained", "unseen", "all"), ["goals", *_MODELS]),
+    ("reach-every-goal-greedy", _EVERY_GOAL, _models("all", mode="greedy"), _MODELS),
+    ("reach-every-goal-runs", ("replay-search",), run_rows, _RUNS),
     ("hindsight-ablation", ("hindsight-half", "hindsight-none"), _models("all"), _MODELS),
 ]
 
