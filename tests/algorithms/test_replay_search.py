@@ -62,7 +62,7 @@ def test_episodes_go_to_the_trained_goals_alone(scene_file: Path) -> None:
     assert one.algorithm.replay_steps == 9
 
 
-@pytest.mark.parametrize(("frames", "starts"), [(260_000, 100_000), (1_000_000, 100_000), (500, 200)])
+@pytest.mark.parametrize(("frames", "starts"), [(340_000, 100_000), (1_000_000, 100_000), (500, 200)])
 def test_a_search_begins_after_a_part_of_the_training(scene_file: Path, frames: int, starts: int) -> None:
     """And does not stop where a resumed training is given more frames."""
     algorithm = trainer(scene_file, f"total_frames={frames}", "algorithm.learning_starts=null").algorithm
@@ -82,8 +82,8 @@ def test_a_search_begins_after_a_part_of_the_training(scene_file: Path, frames: 
         ("algorithm.num_goals=0", "algorithm.num_goals is 0; give 1 or more"),
         ("algorithm.batch_size=7", "batch_size is 7 for 8 goals"),
         ("algorithm.path_share=1.5", "path_share is 1.5"),
-        ("algorithm.learning_starts=-1", "learning_starts is -1 of total_frames 260000: nothing would be"),
-        ("algorithm.learning_starts=260000", "learning_starts is 260000 of total_frames 260000"),
+        ("algorithm.learning_starts=-1", "learning_starts is -1 of total_frames 340000: nothing would be"),
+        ("algorithm.learning_starts=340000", "learning_starts is 340000 of total_frames 340000"),
         ("agent.history=2", "agent.history=1"),
         ("agent=lstm", "agent.memory=null"),
         ("agent.observation=features", "agent.observation=index"),
