@@ -94,10 +94,10 @@ def cannot_write(path: str | Path, error: OSError) -> ResultError:
     """The error for a file that the system does not take.
 
     >>> str(cannot_write("a.csv", OSError(28, "No space left on device")))
-    'a.csv: cannot be written (No space left on device); what was there before is as it was'
+    'a.csv: cannot be written (No space left on device); the previous file, if any, is unchanged'
     """
     return ResultError(
-        f"{path}: cannot be written ({error.strerror or error}); what was there before is as it was"
+        f"{path}: cannot be written ({error.strerror or error}); the previous file, if any, is unchanged"
     )
 
 

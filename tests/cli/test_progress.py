@@ -26,9 +26,9 @@ def test_in_a_file_there_is_a_line_every_ten_seconds_and_at_the_end(monkeypatch:
             clock.now += 1.0
             advance()
     assert output.getvalue().splitlines() == [
-        "reading: 10 of 30 pictures | 1.0 a second | 0:20 to go",
-        "reading: 20 of 30 pictures | 1.0 a second | 0:10 to go",
-        "reading: 30 of 30 pictures | 1.0 a second",
+        "reading: 10 of 30 pictures | 1.0 per second | 0:20 to go",
+        "reading: 20 of 30 pictures | 1.0 per second | 0:10 to go",
+        "reading: 30 of 30 pictures | 1.0 per second",
     ]
 
 

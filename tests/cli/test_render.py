@@ -77,6 +77,6 @@ def test_the_renderer_gets_the_plan_and_its_progress_is_told(
     assert given["backbone"] == ("efficientnet-lite0", None)
     assert "rendering with chalk" in result.stderr
     assert "2 of 2 frames" in result.stderr
-    assert "0.25 s a frame; 50.0 % of them look like another state" in result.stdout
+    assert "0.25 s per frame; 50.0 % of them look like another state" in result.stdout
     run("render", "--plan", tmp_path / "bath.yaml", "-o", tmp_path / "bath.h5", "--scalar")
     assert given["backend"] == Backend("scalar_rgb")

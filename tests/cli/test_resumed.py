@@ -26,9 +26,9 @@ def test_the_rate_is_of_this_run(monkeypatch: pytest.MonkeyPatch) -> None:
             clock.now += 1.0
             report(done, 100)
     assert output.getvalue().splitlines() == [
-        "encoding (some was there already): 10 of 30 pictures | 1.0 a second | 0:20 to go",
-        "encoding (some was there already): 20 of 30 pictures | 1.0 a second | 0:10 to go",
-        "encoding (some was there already): 30 of 30 pictures | 1.0 a second",
+        "encoding (some was there already): 10 of 30 pictures | 1.0 per second | 0:20 to go",
+        "encoding (some was there already): 20 of 30 pictures | 1.0 per second | 0:10 to go",
+        "encoding (some was there already): 30 of 30 pictures | 1.0 per second",
     ]
 
 
@@ -42,8 +42,8 @@ def test_what_begins_anew_has_a_line_of_its_own(monkeypatch: pytest.MonkeyPatch)
         clock.now += 20.0
         report(2_000_000, 2_000_000)
     assert output.getvalue().splitlines() == [
-        "fetching: 1.0 of 2.0 MB | 0.1 MB a second | 0:10 to go",
-        "fetching: 2.0 of 2.0 MB | 0.1 MB a second",
+        "fetching: 1.0 of 2.0 MB | 0.1 MB per second | 0:10 to go",
+        "fetching: 2.0 of 2.0 MB | 0.1 MB per second",
     ]
 
 

@@ -35,7 +35,7 @@ def test_a_disk_that_is_full(tmp_path: Path):
     assert path.read_bytes() == whole
     text = (tmp_path / "run.txt").read_text().splitlines()[-1]
     assert text.startswith(f"error: {path}: cannot be written (File too large); ")
-    assert text.endswith(f"{path} is as it was")
+    assert text.endswith(f"resume from {path}")
     assert {place.name for place in path.parent.iterdir()} == {path.name, "config.json", "metrics.csv"}
     assert ended(start(tmp_path / "other", *more[:1], prepare=limit)) == 1
     assert (tmp_path / "other.txt").read_text().splitlines()[-1].endswith("there is no checkpoint yet")

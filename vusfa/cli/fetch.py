@@ -19,16 +19,16 @@ def fetch(
     name: Annotated[str, typer.Argument(help="What to fetch: thor-v1.", show_default=False)],
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the scenes.")] = Path("scenes"),
     mirror: Annotated[
-        list[str] | None, typer.Option(help="Ask this address; may be given several times.")
+        list[str] | None, typer.Option(help="Address to try; may be given several times.")
     ] = None,
     config: Annotated[
-        Path | None, typer.Option(help="YAML file of archives, mirrors and patience.", show_default=False)
+        Path | None, typer.Option(help="YAML file of archives, mirrors and timeouts.", show_default=False)
     ] = None,
 ) -> None:
     """Fetch published scenes: the original THOR v1 dumps, four rooms of 180 to 676 states.
 
-    A download that breaks off goes on where it was, also after Ctrl-C and in the next run; mirrors are asked
-    in turn. What arrives is unpacked aside and let in only when its checksums, its schema, its numbers of
+    An interrupted download resumes, also after Ctrl-C and in the next run; mirrors are tried in turn. The
+    archive is unpacked to a temporary folder and accepted only if its checksums, its schema, its numbers of
     states and a breadth-first search of every graph agree.
 
     Examples:

@@ -1,4 +1,4 @@
-"""``vusfa film``: one walk of a trained agent, to be watched."""
+"""``vusfa film``: one walk of a trained agent as a GIF."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def film(
     out: Annotated[Path, typer.Option(help="GIF to write; replaced if it exists.")] = Path("walk.gif"),
     scene: Annotated[str | None, typer.Option(help="Name of the room; by default the agent's first.")] = None,
     goal: Annotated[
-        int | None, typer.Option(help="State id; by default the trained goal with the longest way.")
+        int | None, typer.Option(help="State id; by default the trained goal with the longest path.")
     ] = None,
     start: Annotated[
         int | None, typer.Option(help="State id; by default the one farthest from the goal.")

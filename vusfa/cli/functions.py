@@ -1,7 +1,7 @@
 """The grammar of all commands, and functions as commands: parameters become arguments, docstrings their help.
 
-A parameter that may be given by position is an argument, a keyword-only one an option. Options are written as
-settings of a training are, ``seeds=[0,1,2]``, or with dashes, ``--seeds 0 1 2``.
+Positional parameters are arguments, keyword-only ones options. Options are written like settings of a
+training, ``seeds=[0,1,2]``, or with dashes, ``--seeds 0 1 2``.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ class Command(TyperCommand):
             name: param for param in self.params if isinstance(param, TyperOption) for name in param.opts
         }
         words: list[str] = []
-        taking: TyperOption | None = None  # the option before this word, if that takes words
+        taking: TyperOption | None = None  # the preceding option, if it takes values
         for place, word in enumerate(args):
             name, equals, value = word.partition("=")
             setting = options.get("--" + name.replace("_", "-")) if equals and name.isidentifier() else None
@@ -57,17 +57,17 @@ class Command(TyperCommand):
 
 
 def _spelled(option: TyperOption, value: str) -> list[str]:
-    """An option with dashes; of a flag ``true`` or ``false``."""
+    """An option with dashes; a flag's value is ``true`` or ``false``."""
     if option.is_flag:
         spelled = {"true": option.opts[:1], "false": option.secondary_opts[:1]}
-        return spelled.get(value.lower(), [f"{option.opts[0]}={value}"])  # the latter click refuses
+        return spelled.get(value.lower(), [f"{option.opts[0]}={value}"])  # click refuses the latter
     if option.multiple:
         return [f"{option.opts[0]}={item.strip()}" for item in value.strip("[]").split(",") if item.strip()]
     return [f"{option.opts[0]}={value}"]
 
 
 class App(typer.Typer):
-    """A group of commands that share the grammar, and the looks of their help."""
+    """A group of commands with the same grammar and style of help."""
 
     def __init__(self, **settings: Any) -> None:
         looks: dict[str, Any] = {
@@ -79,12 +79,12 @@ class App(typer.Typer):
         super().__init__(**{**looks, **settings})
 
     def command(self, name: str | None = None, **settings: Any) -> Any:
-        """As of :class:`typer.Typer`."""
+        """Register a command, see :class:`typer.Typer`."""
         return super().command(name, **{"cls": Command, **settings})
 
 
 def as_command(function: Callable[..., Any]) -> Callable[..., Any]:
-    """A function as typer reads it: the help of each parameter is that of the docstring's ``Args``.
+    """Convert a function for typer: the docstring's ``Args`` become the help of each parameter.
 
     >>> def walk(goal: int, *, steps: int = 500) -> None:
     ...     '''Walk to a goal.
@@ -119,7 +119,7 @@ def as_command(function: Callable[..., Any]) -> Callable[..., Any]:
         except KeyboardInterrupt as interrupt:
             typer.echo(f"error: {str(interrupt) or 'interrupted'}", err=True)
             raise typer.Exit(130) from interrupt
-        except Exception as error:  # of Hydra's: a setting among the arguments
+        except Exception as error:  # Hydra's, for a setting among the arguments
             if type(error).__module__.partition(".")[0] not in ("hydra", "omegaconf"):
                 raise
             from vusfa.cli.launch import explain
@@ -136,11 +136,11 @@ def as_command(function: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def make_app(functions: Mapping[str, Callable[..., Any]], examples: Sequence[str] = ()) -> typer.Typer:
-    """An application of functions by name; one called "" is the application itself.
+    """Make an application of functions; one named "" is the application itself.
 
     Args:
-        functions: by name.
-        examples: command lines; the help of each function ends with its own.
+        functions: functions by name.
+        examples: command lines; each is shown in its function's help.
     """
     app = App(add_completion=False, no_args_is_help="" not in functions)
     for name, function in functions.items():
@@ -166,9 +166,9 @@ def forward(app: typer.Typer, name: str, forwarded: Forwarded) -> None:
     """Add functions to an application as one command that imports them when it runs.
 
     Args:
-        app: gets the command.
-        name: of the command.
-        forwarded: what it runs.
+        app: application to extend.
+        name: name of the command.
+        forwarded: functions to run.
     """
 
     @app.command(

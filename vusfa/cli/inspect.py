@@ -1,4 +1,4 @@
-"""``vusfa scenes list``, ``show``, ``check`` and ``compare``: look at scenes that are there."""
+"""``vusfa scenes list``, ``show``, ``check`` and ``compare``: inspect existing scenes."""
 
 from __future__ import annotations
 
@@ -33,16 +33,16 @@ def list_scenes(
         typer.Argument(help="Bundled names, scene files, folders of them.", metavar="SCENE|DIR..."),
     ] = None,
     grouped: Annotated[
-        bool, typer.Option("--by-name", help="Instead, how many states look alike in all scenes of a name.")
+        bool, typer.Option("--by-name", help="List instead the share of look-alikes per name of scene.")
     ] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Write JSON instead of a table.")] = False,
-    walk_steps: Annotated[int, typer.Option(min=0, help="Actions that the random walk has.")] = 500,
+    walk_steps: Annotated[int, typer.Option(min=0, help="Limit of actions of the random walk.")] = 500,
 ) -> None:
-    """List scenes: how large they are, how far their ways, how well a random walk does.
+    """List scenes: size, path lengths, success of a random walk.
 
     Without arguments: the bundled rooms and the scene files of the current folder. Success of the random walk
-    is exact, the mean over all goals and all starts that can reach them. A state looks like another where
-    their features' cosine is 0.999 or more. Exit code 1 if a file has faults.
+    is exact, the mean over all goals and all starts that can reach them. A state looks like another if the
+    cosine of their features is 0.999 or more. Exit code 1 if a file has faults.
 
     Examples:
 
@@ -97,10 +97,10 @@ def show(
     ] = None,
     pictures: Annotated[int, typer.Option(min=1, max=100, help="How many pictures to show.")] = 12,
 ) -> None:
-    """Draw a scene as one PNG, pictures and floor map with all poses, and print where it comes from.
+    """Draw a scene as one PNG, pictures and floor map with all poses, and print its provenance.
 
-    The pictures are taken from all over the room; their numbers are on the map, where +Z is up, every pose is
-    a dart that points where it looks, and poses on islands are red.
+    The pictures are spread over the room; their numbers are on the map, where +Z is up, every pose is a dart
+    that points along its heading, and poses on islands are red.
 
     Examples:
 
@@ -118,7 +118,7 @@ def show(
 
 
 def _description(scene: Scene, summary: Summary) -> list[str]:
-    """The scene's numbers, its origin, and its other attributes, a line each."""
+    """Lines with the scene's numbers, its origin, and its other attributes."""
     from vusfa.scenes.provenance import Provenance
 
     lines = [
@@ -139,7 +139,7 @@ def _description(scene: Scene, summary: Summary) -> list[str]:
 
 
 def _indented(attributes: dict[str, Any], longest: int | None = None) -> list[str]:
-    """Attributes by name, those of several lines below it, and of no more than ``longest``."""
+    """Lines of attributes; several lines stand below the name, at most ``longest`` of them."""
     lines = []
     for name, value in attributes.items():
         parts = value if isinstance(value, list) else str(value).splitlines()
@@ -161,10 +161,10 @@ def check(
         ),
     ],
 ) -> None:
-    """List everything that is wrong with scenes; exit code 1 if anything is.
+    """List all faults of scenes; exit code 1 if there are any.
 
-    The loader's own rules: shapes and types, every move of the graph, the shortest paths by a search of
-    it, the features, the poses, and every picture.
+    The loader's own rules: shapes and types, every move of the graph, the shortest paths by a search of the
+    graph, the features, the poses, and every picture.
 
     Examples:
 
@@ -192,9 +192,9 @@ def compare(
     scene: Annotated[str, typer.Argument(help="Bundled name or scene file.", show_default=False)],
     other: Annotated[str, typer.Argument(help="Another of the same room.", show_default=False)],
 ) -> None:
-    """Say whether two scenes are the same room, and how far their pictures and features are apart.
+    """Check whether two scenes are the same room, and compare their pictures and features.
 
-    Pictures: the mean absolute difference of values 0 to 255. Features: the cosine of each state's in both.
+    Pictures: the mean absolute difference of values 0 to 255. Features: the cosine per state.
     Exit code 1 if an action leads elsewhere or a pose differs.
 
     Examples:

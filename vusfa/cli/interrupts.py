@@ -1,4 +1,4 @@
-"""Ctrl-C while a command is starting: a line instead of the traceback of an import."""
+"""Ctrl-C while a command starts: one line instead of the traceback of an import."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ __all__ = ["quiet_interrupts"]
 
 
 def quiet_interrupts() -> None:
-    """Let an interruption that nothing handles end in one line; other exceptions keep their traceback."""
+    """Report an unhandled interruption in one line; other exceptions keep their traceback."""
     before = sys.excepthook
 
     def hook(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:

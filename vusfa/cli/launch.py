@@ -1,6 +1,6 @@
-"""Hydra around a job: settings in, one line on whatever is wrong with them, exit codes out.
+"""Run a job with Hydra: composed settings, one line per error, exit codes.
 
-The one part of the command line that needs Hydra (extra ``recipes``). A job is a function of its settings::
+The only part of the command line that needs Hydra (extra ``recipes``). A job is a function of its settings::
 
     def main(settings, overrides):
         ...
@@ -47,29 +47,28 @@ Job = Callable[[dict[str, Any], list[str]], int]
 
 
 def launch(job: Job, folder: Path = FOLDER, name: str = "train") -> None:
-    """Composes the settings from the command line, runs the job with them, exits with the code that it
-    returns.
+    """Compose the settings from the command line, run the job with them, exit with its code.
 
-    What a user got wrong (:class:`~vusfa.errors.VusfaError`, or an error of Hydra's) ends in one line on
-    standard error and code 2; what the machine did not do (a worker died, the disk is full) in one line and
-    code 1; a signal in 128 and its number, which ends a sweep, too. An error of ours keeps its traceback.
+    A mistake of the user (:class:`~vusfa.errors.VusfaError`, or an error of Hydra) ends in one line on
+    standard error and code 2; a failure of the machine (a worker died, the disk is full) in one line and
+    code 1; a signal in code 128 plus its number, which ends a sweep, too. A bug keeps its traceback.
 
     Args:
-        job: gets the settings, plain and checked, and the command line's overrides.
-        folder: of the configuration files.
-        name: of the primary one.
+        job: called with the settings, plain and checked, and the command line's overrides.
+        folder: folder of the configuration files.
+        name: name of the primary file.
     """
     # Hydra then raises its errors instead of printing them; nothing else changes.
     os.environ["HYDRA_FULL_ERROR"] = "1"
-    if "RL_LOGGING_LEVEL" not in os.environ:  # how TorchRL's log is asked for
+    if "RL_LOGGING_LEVEL" not in os.environ:  # enables TorchRL's log
         logging.getLogger("torchrl").setLevel(logging.WARNING)
     use_own_temporary_folder()
     sys.argv[1:] = [_quoted(argument) for argument in sys.argv[1:]]
     codes: list[int] = []
 
     def guarded(cfg: DictConfig) -> None:
-        # Errors are reported in here: one that passed through Hydra would get lines of Hydra's around it.
-        # As typed: one with an interpolation would be resolved by being looked at.
+        # Errors are reported in here: Hydra would add lines to one that passed through it.
+        # As typed: reading one with an interpolation would resolve it.
         overrides: Any = OmegaConf.to_container(HydraConfig.get().overrides.task, resolve=False)
         codes.append(_report(lambda: job(_settled(cfg, overrides), overrides), folder))
         if codes[-1] > 128:  # a signal is meant for all runs of a sweep; Hydra would begin the next
@@ -84,22 +83,22 @@ def launch(job: Job, folder: Path = FOLDER, name: str = "train") -> None:
     code = _report(run, folder)
     try:
         sys.stdout.flush()
-    except OSError:  # whoever read it has gone
+    except OSError:  # the reader has gone
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     sys.exit(code)
 
 
 class _Stopped(BaseException):
-    """A signal has ended a run of a sweep."""
+    """Raised when a signal has ended a run of a sweep."""
 
 
 def compose(folder: Path = FOLDER, name: str = "train", overrides: Sequence[str] = ()) -> DictConfig:
-    """The configuration as the command line would make it, without running anything.
+    """Compose the configuration as the command line would, without running anything.
 
     Args:
-        folder: of the configuration files.
-        name: of the primary one.
-        overrides: what would be on the command line.
+        folder: folder of the configuration files.
+        name: name of the primary file.
+        overrides: words of the command line.
 
     >>> compose(overrides=["algorithm=hindsight", "seed=3"]).algorithm.name
     'hindsight'
@@ -109,7 +108,7 @@ def compose(folder: Path = FOLDER, name: str = "train", overrides: Sequence[str]
 
 
 def explain(error: Exception, folder: Path) -> str:
-    """One line for an error of Hydra's: what is wrong, and what would be right."""
+    """One line for an error of Hydra: the fault and the remedy."""
     text = " ".join(str(error).split())
     if isinstance(error, OverrideParseException):
         reason = text.split(" See https")[0]
@@ -128,14 +127,14 @@ def explain(error: Exception, folder: Path) -> str:
 
 
 def _settled(cfg: DictConfig, overrides: Sequence[str]) -> dict[str, Any]:
-    """Interpolations resolved, names and types checked; of a resumed run, its checkpoint's settings."""
+    """Resolve interpolations, check names and types; a resumed run has its checkpoint's settings."""
     model = OmegaConf.select(cfg, "agent.model")
-    resolve_config("null" if model is None else str(model))  # before anything is looked up by its name
+    resolve_config("null" if model is None else str(model))  # before any lookup by its name
     check_overrides(overrides)
     OmegaConf.resolve(cfg)
     context = HydraConfig.get()
     if context.mode == RunMode.MULTIRUN and cfg.resume in (None, AUTO):
-        # runs of one sweep may differ in what their folder's name does not tell, and begin in the same second
+        # runs of a sweep may have equal folder names and begin in the same second
         if cfg.folder is None:
             cfg.folder = context.runtime.output_dir
         elif not any(word.startswith("folder=") and set(word) & set(",$(") for word in sys.argv[1:]):
@@ -148,7 +147,7 @@ def _settled(cfg: DictConfig, overrides: Sequence[str]) -> dict[str, Any]:
 
 
 def _quoted(argument: str) -> str:
-    """A path that Hydra would read as something else (``=``, ``,``, ``(``), in quotes.
+    """Quote a path with characters that Hydra would interpret (``=``, ``,``, ``(``).
 
     >>> _quoted("resume=runs/lr=1,2/checkpoint.pt"), _quoted("resume=auto"), _quoted("seed=1,2")
     ("resume='runs/lr=1,2/checkpoint.pt'", 'resume=auto', 'seed=1,2')

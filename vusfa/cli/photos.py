@@ -15,7 +15,7 @@ __all__ = ["register"]
 
 
 class Store(StrEnum):
-    """How a scene file keeps its pictures."""
+    """Format of the pictures in a scene file."""
 
     JPEG = "jpeg"
     RAW = "raw"
@@ -45,29 +45,29 @@ def from_photos(
         int | None,
         typer.Option(help="Degrees between headings, 45, 90, 180 or 360; inferred when not given."),
     ] = None,
-    size: Annotated[str, typer.Option(help="WIDTHxHEIGHT that the pictures are made.")] = "200x150",
-    store: Annotated[Store, typer.Option(help="How the pictures are kept.")] = Store.JPEG,
+    size: Annotated[str, typer.Option(help="WIDTHxHEIGHT of the stored pictures.")] = "200x150",
+    store: Annotated[Store, typer.Option(help="Format of the stored pictures.")] = Store.JPEG,
     features: Annotated[
-        Path | None, typer.Option(help="Features you have: .npy, (N, F) or (N, C, F), in the table's order.")
+        Path | None, typer.Option(help="Existing features: .npy, (N, F) or (N, C, F), in the table's order.")
     ] = None,
     backbone: Annotated[
         str, typer.Option(help="Network that computes features otherwise; see `vusfa scenes encode --help`.")
     ] = "efficientnet-lite0",
-    weights: Annotated[Path | None, typer.Option(help="Its weights, where they are a file of yours.")] = None,
+    weights: Annotated[Path | None, typer.Option(help="File of the network's weights.")] = None,
     name: Annotated[str | None, typer.Option(help="The scene's name; by default the file's.")] = None,
     by: Annotated[str | None, typer.Option(help="Who took the photographs.")] = None,
     licence: Annotated[list[str] | None, typer.Option(help="Licence; may be given more than once.")] = None,
-    credit: Annotated[list[str] | None, typer.Option(help="Whom to name; more than once.")] = None,
+    credit: Annotated[list[str] | None, typer.Option(help="Person to credit; may be repeated.")] = None,
     force: Force = False,
 ) -> None:
-    """Make a scene of photographs that were taken at known poses.
+    """Make a scene from photographs that were taken at known poses.
 
-    poses.csv says where: `file,x,z,heading`, metres and degrees, 0 looks along +Z, 90 along +X. Poses on a
-    grid, a quarter of a step off at most, are joined by MoveForward, RotateRight, RotateLeft and
+    poses.csv lists the poses: `file,x,z,heading`, metres and degrees, 0 along +Z, 90 along +X. Poses on a
+    grid, at most a quarter of a step off, are joined by MoveForward, RotateRight, RotateLeft and
     MoveBackward. For anything else, or where a wall stands between two poses, edges.csv says which action
     leads where: `state,action,next`, with the pictures' names as states; poses are optional then.
 
-    Stopped while it computes features, it goes on where it was when the same command is given again.
+    If stopped while it computes features, it resumes when the same command is given again.
 
     Examples:
 
@@ -134,7 +134,7 @@ def _size(size: str) -> tuple[int, int]:
 
 
 def _warn(left_out: tuple[str, ...], scene: Any) -> None:
-    """What may be an oversight."""
+    """Print notes on likely oversights."""
     if left_out:
         some = ", ".join(left_out[:3]) + (", ..." if len(left_out) > 3 else "")
         typer.echo(f"note: {len(left_out)} pictures are in no table and were left out: {some}", err=True)

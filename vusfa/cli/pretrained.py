@@ -1,4 +1,4 @@
-"""``vusfa pretrained``: agents that come with the package."""
+"""``vusfa pretrained``: the agents that come with the package."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ def show(
 
 def make(
     cells: Annotated[
-        list[Path], typer.Argument(help="Folders of results.", metavar="CELL...", show_default=False)
+        list[Path], typer.Argument(help="Folders of results.", metavar="RUN...", show_default=False)
     ],
     runs: Annotated[Path, typer.Option(help="Folder of the trainings of these results.")] = Path("runs"),
     commit: Annotated[str, typer.Option(help="Commit of the code that trained.", show_default=False)] = "",
@@ -74,10 +74,10 @@ def make(
         Path | None, typer.Option(help="Folder to write to; the package's own by default.")
     ] = None,
 ) -> None:
-    """Make pretrained agents and their model cards from results and the checkpoints that these chose.
+    """Make pretrained agents and their model cards from results and the checkpoints that they name.
 
-    Weights are rounded to float16. The rounded agent is computed exactly, as its cell was, and nothing is
-    written if a mean is off.
+    Weights are rounded to float16. The rounded agent is evaluated exactly, as its run was, and nothing is
+    written if a mean differs.
 
     Examples:
 

@@ -14,19 +14,19 @@ from rich.text import Text
 __all__ = ["progress", "time_to_go"]
 
 _EVERY = 10.0  # seconds between two lines where the output is not a terminal
-_BRIEF = 2.0  # seconds of work that need no line there at all
+_BRIEF = 2.0  # seconds of work that print no line there
 
 
 @contextmanager
 def progress(
     what: str, total: float, unit: str = "", console: Console | None = None
 ) -> Iterator[Callable[..., None]]:
-    """Show how far a piece of work is, on stderr: a bar on a terminal, elsewhere a line now and then.
+    """Show the progress of some work on stderr: a bar on a terminal, elsewhere a line every ten seconds.
 
     Args:
-        what: the work, "reading pictures".
-        total: how much there is of it.
-        unit: what is counted, "pictures"; "B" for bytes, which are written as MB.
+        what: the work, such as "reading pictures".
+        total: number of units.
+        unit: name of the units, such as "pictures"; "B" for bytes, which are shown as MB.
         console: where to write; standard error by default, so that results can be piped.
 
     Yields:
@@ -40,7 +40,7 @@ def progress(
     columns = (TextColumn("{task.description}"), BarColumn(), _State(unit))
     began = printed = time.monotonic()
     done = 0.0
-    # On no terminal rich would print its one last line only.
+    # Without a terminal rich would print the last line only.
     with Progress(*columns, console=console, disable=not console.is_terminal) as bar:
         task = bar.add_task(what, total=total)
 
@@ -66,7 +66,7 @@ class _State(ProgressColumn):
         self._unit = unit
 
     def render(self, task: Task) -> Text:
-        """The text right of the bar."""
+        """Text to the right of the bar."""
         speed = task.finished_speed if task.finished else task.speed
         rate = math.nan if speed is None else speed
         return Text(_describe(task.completed, task.total or 0, rate, self._unit))
@@ -75,14 +75,14 @@ class _State(ProgressColumn):
 def _describe(done: float, total: float, rate: float, unit: str) -> str:
     """
     >>> _describe(50, 200, 2.5, "pictures")
-    '50 of 200 pictures | 2.5 a second | 1:00 to go'
+    '50 of 200 pictures | 2.5 per second | 1:00 to go'
     """
     if unit == "B":
         text = f"{done / 1e6:.1f} of {total / 1e6:.1f} MB"
-        pace = f"{rate / 1e6:.1f} MB a second"
+        pace = f"{rate / 1e6:.1f} MB per second"
     else:
         text = f"{done:.0f} of {total:.0f} {unit}".rstrip()
-        pace = f"{rate:.{0 if rate >= 10 else 1}f} a second"
+        pace = f"{rate:.{0 if rate >= 10 else 1}f} per second"
     if not rate > 0:
         return text
     left = total - done

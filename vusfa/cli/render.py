@@ -50,10 +50,10 @@ def render(
     flat: Annotated[
         str | None, typer.Option(help="Draw two to five rooms in a row as one scene: kitchen,hall,bedroom.")
     ] = None,
-    seed: Annotated[int, typer.Option(help="What it is drawn from: the same seed, the same room.")] = 1,
+    seed: Annotated[int, typer.Option(help="Random seed of the plan: the same seed, the same room.")] = 1,
     cells: Annotated[
         int | None,
-        typer.Option(help="Free places it shall have, of half a metre; by default the kind's own."),
+        typer.Option(help="Number of free places, half a metre apart; by default the kind's own."),
     ] = None,
     output: Annotated[
         Path | None,
@@ -67,13 +67,13 @@ def render(
     backbone: Annotated[
         str, typer.Option(help="Network that computes the features; see `vusfa scenes encode --help`.")
     ] = "efficientnet-lite0",
-    weights: Annotated[Path | None, typer.Option(help="Its weights, where they are a file of yours.")] = None,
+    weights: Annotated[Path | None, typer.Option(help="File of the network's weights.")] = None,
     scalar: Annotated[
-        bool, typer.Option("--scalar", help="Do without LLVM also where there is one; much slower.")
+        bool, typer.Option("--scalar", help="Render without LLVM even if it is installed; much slower.")
     ] = False,
     threads: Annotated[
         int | None,
-        typer.Option(min=1, help="Threads that render; by default one for each core, without LLVM one."),
+        typer.Option(min=1, help="Number of threads; by default one per core, or one without LLVM."),
     ] = None,
     force: Force = False,
 ) -> None:
@@ -83,7 +83,7 @@ def render(
     Sweet Home 3D's .sh3f libraries named by SH3D_FURNITURE. With LLVM 16 or later (Debian: libllvm19) it is
     several times faster. --plan-only needs none of these.
 
-    Stopped, it goes on where it was when the same command is given again.
+    If stopped, it resumes when the same command is given again.
 
     Examples:
 

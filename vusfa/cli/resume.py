@@ -1,7 +1,7 @@
-"""Settings of a resumed run: those of its checkpoint, and what is given now.
+"""Settings of a resumed run: those of its checkpoint, and overrides.
 
-What a checkpoint says is data. Its settings are checked like any other before they are used; its recorded
-command line is never run.
+The content of a checkpoint is data. Its settings are checked like any other before they are used; its
+recorded command line is never run.
 """
 
 from __future__ import annotations
@@ -18,16 +18,16 @@ __all__ = ["resumed_settings"]
 
 
 def resumed_settings(given: Mapping[str, Any], overrides: Sequence[str]) -> dict[str, Any]:
-    """Settings to continue with: the checkpoint's, in its folder; what is given now wins.
+    """Settings to continue with: the checkpoint's, in its folder; overrides take precedence.
 
-    A schedule that ended with the run ends with ``total_frames`` of now, unless its horizon is given.
+    A schedule that ended with the run ends with the new ``total_frames``, unless its horizon is given.
 
     Args:
         given: settings composed from the command line, checked; ``resume`` names the checkpoint.
-        overrides: of the command line, ``setting=value``.
+        overrides: words of the command line, ``setting=value``.
 
     Raises:
-        CheckpointError: the checkpoint cannot be read, or holds settings that there are none of.
+        CheckpointError: the checkpoint cannot be read, or holds unknown settings.
         ConfigError: an override that a resumed run cannot take.
     """
     path = checkpoint_file(given["resume"])
@@ -44,7 +44,7 @@ def resumed_settings(given: Mapping[str, Any], overrides: Sequence[str]) -> dict
             )
     settings = copy.deepcopy(stored)
     settings["folder"] = str(path.resolve().parent)
-    sources = state["scenes"].get("sources")  # as they are found from any folder
+    sources = state["scenes"].get("sources")  # paths that are valid in any folder
     if sources:
         settings["scenes"] = list(sources)
     names = [override.partition("=")[0] for override in overrides]
@@ -70,7 +70,7 @@ def _completed(stored: Mapping[str, Any], defaults: Mapping[str, Any]) -> dict[s
 
 
 def _copy(source: Mapping[str, Any], target: dict[str, Any], parts: Sequence[str]) -> None:
-    """Takes over one entry, by the parts of its dotted name."""
+    """Copy one entry, by the parts of its dotted name."""
     for part in parts[:-1]:
         source, target = source[part], target.setdefault(part, {})
     target[parts[-1]] = copy.deepcopy(source[parts[-1]])

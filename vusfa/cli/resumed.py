@@ -1,4 +1,4 @@
-"""Progress of work that may begin in the middle, because an earlier run was stopped there."""
+"""Progress of work that resumes an earlier run."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ __all__ = ["resumed"]
 
 @contextmanager
 def resumed(what: str, unit: str, console: Console | None = None) -> Iterator[Callable[[int, int], None]]:
-    """Show how far a piece of work is that reports ``(done, total)``; rate and time to go are this run's.
+    """Show the progress of work that reports ``(done, total)``; rate and time to go are those of this run.
 
     Args:
-        what: the work, "encoding".
-        unit: what is counted, "pictures"; "B" for bytes.
+        what: the work, such as "encoding".
+        unit: name of the units, such as "pictures"; "B" for bytes.
         console: where to write; standard error by default.
 
     Yields:
-        ``report(done, total)``; a first ``done`` above 0 was there already, and a ``done`` below the last one
-        begins anew. A total of 0 is not known.
+        ``report(done, total)``; a first ``done`` above 0 is that of an earlier run, a ``done`` below the last
+        one starts again. A total of 0 is unknown.
 
     >>> with resumed("adding", "numbers", Console(quiet=True)) as report:
     ...     report(2, 4)
@@ -36,7 +36,7 @@ def resumed(what: str, unit: str, console: Console | None = None) -> Iterator[Ca
         def report(done: int, total: int) -> None:
             nonlocal advance, before
             if before < 0 or done < before:
-                stack.close()  # the last bar, when something was started again
+                stack.close()  # the last bar, if the work was started again
                 name = f"{what} (some was there already)" if done else what
                 advance = stack.enter_context(progress(name, max(total - done, 0), unit, console))
             else:

@@ -1,4 +1,4 @@
-"""What every command that reads or writes scene files has in common: names, folders, ``--force``."""
+"""Common parts of commands that read or write scene files: names, folders, ``--force``."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ Force = Annotated[bool, typer.Option("--force", help="Replace the file if it exi
 
 
 def check_target(target: Path, force: bool) -> None:
-    """Refuse, before the work, a file that exists or that could not be written.
+    """Refuse a target file that exists or that cannot be written, before the work begins.
 
     Raises:
         ConfigError: it exists and ``force`` is not given, or its folder cannot be written.
@@ -34,7 +34,7 @@ def check_target(target: Path, force: bool) -> None:
 
 
 def say_next(target: Path) -> None:
-    """Print, on standard error, what can be done with a scene file that was made."""
+    """Print the next commands for a new scene file on standard error."""
     typer.echo(
         f"next: vusfa scenes show {target}; vusfa train preset=replay_search scenes=[{target}]",
         err=True,
@@ -45,7 +45,7 @@ def scene_path(source: str | Path) -> Path:
     """The file of a scene: a bundled name, or a path.
 
     Raises:
-        SceneError: neither.
+        SceneError: there is no such scene or file.
 
     >>> scene_path("kitchen").name, scene_path("rooms/mine.h5").name
     ('kitchen.h5', 'mine.h5')
@@ -65,10 +65,10 @@ def scene_path(source: str | Path) -> Path:
 
 
 def scene_paths(sources: Sequence[str]) -> list[Path]:
-    """Files that names, files and folders mean, each once.
+    """Scene files of names, files and folders, each once.
 
     Raises:
-        SceneError: a name that means nothing, or a folder without scene files.
+        SceneError: a name is unknown, or a folder has no scene files.
     """
     found: dict[Path, None] = {}
     for source in sources:
@@ -83,7 +83,7 @@ def scene_paths(sources: Sequence[str]) -> list[Path]:
 
 
 def scenes_in(folder: Path) -> list[Path]:
-    """Files that may be scenes; HDF5 files of other programs, without a graph, are passed over."""
+    """Files of a folder that may be scenes; HDF5 files without a graph are skipped."""
     from vusfa.scenes.hdf5 import opened
 
     found = []
@@ -94,7 +94,7 @@ def scenes_in(folder: Path) -> list[Path]:
             with opened(path) as file:
                 is_scene = file.get("graph", getlink=True) is not None
         except SceneError:
-            is_scene = True  # or was: its fault is reported later
+            is_scene = True  # its fault is reported later
         if is_scene:
             found.append(path)
     return found

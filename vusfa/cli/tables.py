@@ -15,11 +15,11 @@ __all__ = ["print_wide", "table_of_groups", "table_of_scenes"]
 
 
 def table_of_scenes(rows: Sequence[tuple[str, Summary | SceneError]], walk_steps: int) -> Table:
-    """A row for each scene.
+    """Table with one row per scene.
 
     Args:
-        rows: where it is, and its numbers or its fault.
-        walk_steps: actions that the random walk had.
+        rows: path of each scene, and its numbers or its fault.
+        walk_steps: limit of actions of the random walk.
 
     >>> table_of_scenes([("a.h5", SceneError("a.h5: is empty"))], 500).row_count
     1
@@ -56,7 +56,7 @@ def table_of_scenes(rows: Sequence[tuple[str, Summary | SceneError]], walk_steps
 
 
 def table_of_groups(groups: Sequence[Group]) -> Table:
-    """A row for all scenes of a name.
+    """Table with one row per name of scenes.
 
     >>> table_of_groups([Group("hall", 10, 2120, 0.001, 0.01)]).row_count
     1
@@ -76,7 +76,7 @@ def table_of_groups(groups: Sequence[Group]) -> Table:
 
 
 def print_wide(table: Table) -> None:
-    """Print to standard output; in a file or a pipe a table is as wide as it needs to be."""
+    """Print to standard output; in a file or a pipe a table has its full width."""
     console = Console()
     if not console.is_terminal:
         console = Console(width=max(console.width, console.measure(table).maximum, 200))

@@ -28,15 +28,15 @@ def export_thor(
     grid: Annotated[float, typer.Option(min=0.05, help="Metres between places.")] = 0.5,
     width: Annotated[int, typer.Option(min=1, help="Width of the pictures in pixels.")] = 400,
     height: Annotated[int, typer.Option(min=1, help="Height of the pictures.")] = 300,
-    field_of_view: Annotated[float, typer.Option(help="Degrees, top of the picture to bottom.")] = 90,
-    horizon: Annotated[float, typer.Option(help="Degrees that the camera looks down.")] = 0,
+    field_of_view: Annotated[float, typer.Option(help="Vertical field of view in degrees.")] = 90,
+    horizon: Annotated[float, typer.Option(help="Degrees by which the camera points down.")] = 0,
     headless: Annotated[
         bool, typer.Option("--headless", help="Render without a display (the simulator's CloudRendering).")
     ] = False,
     backbone: Annotated[
         str, typer.Option(help="Network that computes the features; see `vusfa scenes encode --help`.")
     ] = "efficientnet-lite0",
-    weights: Annotated[Path | None, typer.Option(help="Its weights, where they are a file of yours.")] = None,
+    weights: Annotated[Path | None, typer.Option(help="File of the network's weights.")] = None,
     layer: Annotated[str | None, typer.Option(help="Layer whose output is taken, such as avgpool.")] = None,
     crops: Annotated[str | None, typer.Option(help="whole (squashed), centre, or ten.")] = None,
     batch: Annotated[int, typer.Option(min=1, help="Pictures encoded at a time.")] = 32,
@@ -45,8 +45,8 @@ def export_thor(
     """Make a scene from a live AI2-THOR 5 simulator (`pip install 'vusfa[thor]'`).
 
     Every reachable place is photographed in four headings, and every action is tried from every pose.
-    Stopped, it goes on where it was when the same command is given again. This command is tested with a
-    stand-in for the simulator that answers the same calls: its build cannot be had everywhere.
+    If stopped, it resumes when the same command is given again. This command is tested with a
+    stand-in for the simulator that answers the same calls: its build is not available everywhere.
 
     Examples:
 

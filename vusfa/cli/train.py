@@ -1,4 +1,4 @@
-"""``vusfa train``: trains an agent and evaluates it; settings are given as to Hydra."""
+"""``vusfa train``: train an agent and evaluate it; settings are written as for Hydra."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import typer
 
 __all__ = ["register"]
 
-#: Hydra reads everything behind ``train`` itself, ``--help`` included.
+#: Hydra itself reads everything after ``train``, ``--help`` included.
 _HYDRA: dict[str, Any] = {
     "add_help_option": False,
     "context_settings": {
@@ -20,7 +20,7 @@ _HYDRA: dict[str, Any] = {
     },
 }
 
-#: Options of Hydra's own; everything else is a setting.
+#: Hydra's options; everything else is a setting.
 _HYDRA_OPTIONS = {
     *("help", "hydra-help", "version", "cfg", "resolve", "package", "run", "multirun", "info"),
     *("shell-completion", "config-path", "config-name", "config-dir", "experimental-rerun"),
@@ -28,7 +28,7 @@ _HYDRA_OPTIONS = {
 
 
 def register(app: typer.Typer) -> None:
-    """Adds the command."""
+    """Add the command."""
     app.command("train", rich_help_panel="Agents", **_HYDRA)(train)
 
 

@@ -1,4 +1,4 @@
-"""Scenes of arrays: the door for pictures and graphs that come from any program."""
+"""Scenes from arrays: pictures and graphs of any other program."""
 
 from __future__ import annotations
 
@@ -38,13 +38,13 @@ def from_arrays(
     Args:
         path: file to write; replaced if it exists.
         graph: (N, A) integers, next state, -1 = blocked.
-        features: (N, F) or (N, C, F) floats; or a function that makes them of the pictures, such as
+        features: (N, F) or (N, C, F) floats; or a function that computes them from the pictures, such as
             :func:`vusfa.sources.encode.encode_pictures`.
         pictures: (N, H, W, 3) uint8, or N JPEG files as bytes.
         location: (N, 2) metres, x and z; zeros when not given.
         rotation: (N,) degrees, 0 along +z, 90 along +x; zeros when not given.
         actions: A names; those of the THOR v1 dumps when not given and A is 4.
-        name: of the scene; the file's when not given.
+        name: name of the scene; the file's when not given.
         attributes: provenance: str, int, float, or lists of these.
 
     Raises:

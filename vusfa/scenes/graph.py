@@ -36,7 +36,7 @@ def as_table(graph: Tensor | np.ndarray) -> np.ndarray:
     """Check a graph and return it as an int64 array (N, A).
 
     Raises:
-        ValueError: another shape or type, or a successor that is not a state.
+        ValueError: the shape or type is wrong, or a successor is not a state.
     """
     table = graph.detach().cpu().numpy() if isinstance(graph, Tensor) else np.asarray(graph)
     if table.ndim != 2 or table.dtype.kind not in "iu":
@@ -82,7 +82,7 @@ def _breadth_first(edges: sparse.csr_matrix, sources: np.ndarray) -> np.ndarray:
         position[order] = np.arange(len(order), dtype=np.int32)
         ancestor = position[np.append(source, predecessor[order[1:]])]
         depth = np.minimum(np.arange(len(order)), 1)
-        while ancestor.any():  # at every turn twice as many generations
+        while ancestor.any():  # each turn doubles the number of generations
             depth += depth[ancestor]
             ancestor = ancestor[ancestor]
         result[row, order] = depth
@@ -151,7 +151,7 @@ def narrow_distances(distance: np.ndarray) -> Tensor:
 
 
 class BackwardSearch:
-    """Lengths of the shortest paths from every state to one goal after the other, by breadth-first search.
+    """Lengths of the shortest paths from every state to a goal, by breadth-first search.
 
     Args:
         graph: (N, A) integers, -1 = blocked.

@@ -49,14 +49,14 @@ def opened(path: Path) -> Iterator[h5py.File]:
             yield file
     except PermissionError as error:
         raise SceneError(f"{path}: may not be read ({error.strerror}); change its permissions") from error
-    # What HDF5 meets in a damaged file comes as any of these.
+    # h5py raises any of these for a damaged file.
     except (OSError, RuntimeError, KeyError, ValueError) as error:
         if isinstance(error, VusfaError):
             raise
         if isinstance(error, BlockingIOError) or "unable to lock" in str(error):
             raise SceneError(
-                f"{path}: is locked, or its disk knows no locks; close the program that writes it, or set the"
-                f" environment variable HDF5_USE_FILE_LOCKING=FALSE if none does"
+                f"{path}: is locked, or its disk has no file locks; close the program that writes it, or set"
+                f" the environment variable HDF5_USE_FILE_LOCKING=FALSE if none does"
             ) from error
         raise SceneError(
             f"{path}: cannot be read as HDF5 ({error}); the file is truncated, damaged or something else:"
@@ -65,9 +65,9 @@ def opened(path: Path) -> Iterator[h5py.File]:
 
 
 def check_heaps(path: Path) -> int:
-    """Check the global heaps of a file, which hold text and JPEG files; returns the bytes of the largest.
+    """Check the global heaps of a file, which hold text and JPEG files; return the largest size in bytes.
 
-    The HDF5 library, up to version 2.0 at least, never returns from a heap that was overwritten with zeros.
+    The HDF5 library, at least up to version 2.0, hangs on a heap that was overwritten with zeros.
 
     Raises:
         SceneError: a heap is damaged.
@@ -92,7 +92,7 @@ def check_heaps(path: Path) -> int:
 def read_attributes(file: h5py.File, largest: int) -> dict[str, Any]:
     """The attributes of a file as plain values.
 
-    Entries can share a text: each may have the bytes of the ``largest``, see :func:`check_heaps`.
+    Entries can share a text: each may have up to ``largest`` bytes, see :func:`check_heaps`.
 
     Raises:
         OSError: an attribute declares more than :data:`vusfa.limits.MAX_ATTRIBUTE_BYTES`.
@@ -108,10 +108,10 @@ def read_attributes(file: h5py.File, largest: int) -> dict[str, Any]:
 
 @contextmanager
 def replaced(path: Path) -> Iterator[h5py.File]:
-    """A new file, open for writing within a ``with`` block, that takes its name when the block is done.
+    """A new file, open for writing within a ``with`` block that then replaces the old one.
 
-    Until then it lies in the same folder under a temporary name; if the block fails it is removed, and a
-    file that had the name before is untouched.
+    Until then it has a temporary name in the same folder; if the block fails it is removed, and the old
+    file is unchanged.
 
     Raises:
         SceneError: the file cannot be written.
@@ -131,8 +131,8 @@ def dataset_in(file: h5py.File, name: str) -> h5py.Dataset | None:
     """A dataset by name; None when there is none, or a group of that name.
 
     Raises:
-        OSError: it lies outside the file (a link, external storage, a virtual dataset), or declares more than
-            :mod:`vusfa.limits` allows. Nothing outside the file is opened.
+        OSError: its data lie outside the file (a link, external storage, a virtual dataset), or it declares
+            more than :mod:`vusfa.limits` allows. Nothing outside the file is opened.
     """
     link = file.get(name, getlink=True)
     if link is None:
@@ -151,9 +151,9 @@ def dataset_in(file: h5py.File, name: str) -> h5py.Dataset | None:
 
 
 def read_distances(dataset: h5py.Dataset) -> np.ndarray:
-    """A table of distances (N, N), in int16 where that holds every possible one; larger values are clipped.
+    """A table of distances (N, N), in int16 where all possible values fit; larger ones are clipped.
 
-    Some rows are read at a time: other programs write 8 bytes per distance.
+    Rows are read in blocks: other programs write 8 bytes per distance.
     """
     square = dataset.ndim == 2 and dataset.shape[0] == dataset.shape[1] > 0
     if not square or dataset.dtype.kind not in "iu" or dataset.dtype == np.int16:
@@ -165,9 +165,9 @@ def read_distances(dataset: h5py.Dataset) -> np.ndarray:
 
 
 def read_features(dataset: h5py.Dataset) -> np.ndarray:
-    """Features (N, C, F) in float32, some rows at a time: other programs write 2 or 8 bytes per number.
+    """Features (N, C, F) in float32, read in blocks of rows: other programs write 2 or 8 bytes per number.
 
-    What is too large for float32 becomes infinite, which :mod:`vusfa.scenes.validation` finds.
+    Values too large for float32 become infinite, which :mod:`vusfa.scenes.validation` finds.
     """
     if dataset.ndim != 3 or dataset.dtype.kind != "f" or dataset.dtype == np.float32:
         return np.asarray(dataset[()])
@@ -179,25 +179,26 @@ def read_features(dataset: h5py.Dataset) -> np.ndarray:
 
 
 def row_blocks(array: h5py.Dataset | np.ndarray) -> Iterator[slice]:
-    """Rows of an array, some at a time; of a dataset, whole chunks."""
+    """Blocks of rows of an array; those of a dataset are whole chunks."""
     chunk = array.chunks[0] if isinstance(array, h5py.Dataset) and array.chunks else 1
     rows = chunk * max(1, _NUMBERS_AT_ONCE // max(1, chunk * math.prod(array.shape[1:])))
     return (slice(first, first + rows) for first in range(0, len(array), rows))
 
 
 def copy_others(source: Path, target: h5py.File, known: Collection[str], stale: Collection[str] = ()) -> None:
-    """Copy what a file holds besides the content of a scene.
+    """Copy the entries of a file that are not the content of a scene.
 
-    Unknown datasets, groups and links are copied as they lie there, save datasets whose data lie in another
-    file; of known datasets the attributes.
+    Unknown datasets, groups and links are copied unchanged, except datasets whose data lie in another
+    file; known datasets have only their attributes copied.
 
     Args:
-        source: the file.
+        source: the file to copy from.
         target: an open file with its own datasets.
-        known: names of a scene's datasets; of those in ``stale``, with new content, no attributes are copied.
+        known: names of a scene's datasets.
+        stale: those of them with new content, whose attributes are not copied.
 
     Raises:
-        SceneError: something cannot be copied.
+        SceneError: an entry cannot be copied.
     """
     with opened(source) as file:
         for name in file:
@@ -222,7 +223,7 @@ def _copy_attributes(source: h5py.Dataset, target: h5py.Dataset) -> None:
 
 
 def size_fault(dataset: h5py.Dataset) -> str | None:
-    """The fault of a dataset that declares more than it can hold or more than may be read; None without."""
+    """Fault of a dataset that declares more than it can hold or more than may be read; None without one."""
     declared, stored = dataset.nbytes, dataset.id.get_storage_size()
     if dataset.shape and dataset.shape[0] > limits.MAX_STATES:
         return f"declares {dataset.shape[0]} states; at most {limits.MAX_STATES} are read"

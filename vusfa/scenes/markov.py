@@ -1,7 +1,7 @@
-"""Exact success of walks on a scene's graph, without drawing an episode.
+"""Exact success of policies on a scene's graph, without sampling episodes.
 
-Make the goal g absorbing; then the probability ``h_k(s)`` of having met it after at most ``k`` actions from
-``s`` obeys
+Make the goal g absorbing; then the probability ``h_k(s)`` of having reached it after at most ``k`` actions
+from ``s`` obeys
 
     h_0(s) = [s = g],    h_k(g) = 1,    h_k(s) = sum_a pi(a | s, g) h_{k-1}(next(s, a))
 
@@ -54,14 +54,14 @@ def _as_probabilities(
 
 
 def arrival_by_step(graph: Tensor | np.ndarray, action_probabilities: Any, goals: Any) -> Iterator[Tensor]:
-    """h_0, h_1, h_2, ... without end: the probability of having met each goal after at most so many actions.
+    """h_0, h_1, h_2, ... without end: the probability of having reached each goal after so many actions.
 
     Args:
         graph, action_probabilities, goals: see :func:`arrival_probability`. All goals are propagated
             together: give :func:`goals_at_once` of them.
 
     Yields:
-        (G, N) float64; a buffer of its own each time.
+        (G, N) float64; a new tensor each time.
     """
     table = as_table(graph)
     goal_ids = as_states(goals, len(table), "goal")
@@ -96,11 +96,11 @@ def goals_at_once(num_states: int, policy_per_goal: bool = True) -> int:
 def arrival_probability(
     graph: Tensor | np.ndarray, action_probabilities: Any, goals: Any, steps: int
 ) -> Tensor:
-    """Exact probability of having met each goal after at most ``steps`` actions, from every state.
+    """Exact probability of having reached each goal after at most ``steps`` actions, from every state.
 
     Args:
         graph: (N, A) integers, -1 = blocked (the agent stays, the action counts).
-        action_probabilities: (N, A), one policy for all goals, or (G, N, A), one per goal; of the present
+        action_probabilities: (N, A), one policy for all goals, or (G, N, A), one per goal; of the current
             state alone: a policy that sees a history of frames has no exact success.
         goals: one state id, or (G,).
         steps: actions allowed, 0 or more.
@@ -110,7 +110,7 @@ def arrival_probability(
 
     Raises:
         GoalError: a goal that is not a state.
-        ValueError: probabilities of another shape, or that are not distributions.
+        ValueError: probabilities have the wrong shape, or are not distributions.
 
     >>> line = torch.tensor([[1, -1], [2, 0], [-1, 1]])  # right, left
     >>> arrival_probability(line, torch.full((3, 2), 0.5), goals=2, steps=2).tolist()

@@ -1,4 +1,4 @@
-"""Shortest paths of a scene: a table of all where the scene is small, else searched goal by goal and kept."""
+"""Shortest paths of a scene: one table for a small scene, otherwise cached searches per goal."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ class ShortestPaths:
 
     Args:
         graph: (N, A) int64, -1 = blocked; not copied.
-        table: (N, N), ``[s, g]`` from s to g, where it is known. Without one, the paths to a goal are
-            searched when first asked for, and the latest :data:`vusfa.limits.MAX_PATH_BYTES` are kept.
+        table: (N, N), ``[s, g]`` from s to g, if known. Without one, the paths to a goal are
+            searched on first request, and the latest :data:`vusfa.limits.MAX_PATH_BYTES` are kept.
 
     >>> paths = ShortestPaths(np.array([[1, -1], [2, 0], [-1, 1]]))
     >>> paths.to_goals(torch.tensor([2])).tolist(), paths.between(torch.tensor([0, 1]), torch.tensor([1, 1]))
@@ -36,7 +36,7 @@ class ShortestPaths:
 
     @property
     def table(self) -> Tensor:
-        """(N, N) int16, or int32 where a path is too long for it; searched once.
+        """(N, N) int16, or int32 where a path is too long for it; computed once.
 
         Raises:
             SceneError: more than :data:`vusfa.limits.MAX_DISTANCE_STATES` states.

@@ -1,4 +1,4 @@
-"""A scene's pictures, in either of two datasets.
+"""Pictures of a scene, in either of two datasets.
 
 ``observation`` (N, H, W, 3) uint8 is the THOR v1 schema's; ``observation_jpeg`` (N,), each entry the bytes
 of a JPEG file, is ours and about ten times smaller. Where a file has both, ``observation``
@@ -57,13 +57,13 @@ def open_image(source: str | os.PathLike[str] | IO[bytes]) -> Iterator[Image.Ima
     """A JPEG or PNG file, open for decoding within a ``with`` block.
 
     Raises:
-        OSError: whatever is wrong with it, in opening or in decoding.
+        OSError: the file cannot be opened or decoded.
     """
     try:
         with Image.open(source, formats=limits.PICTURE_FORMATS) as image:
             yield image
     except UnidentifiedImageError as error:
-        raise OSError("unknown format") from error  # Pillow's own words name an address in memory
+        raise OSError("unknown format") from error  # Pillow's message names an address in memory
     except OSError:
         raise
     except Exception as error:  # Pillow's decoders raise nearly anything for damaged bytes
@@ -71,13 +71,13 @@ def open_image(source: str | os.PathLike[str] | IO[bytes]) -> Iterator[Image.Ima
 
 
 def check_scans(encoded: bytes) -> None:
-    """Raise an OSError for a JPEG file of so many scans that decoding it would take for ever."""
+    """Raise an OSError for a JPEG file with so many scans that decoding would hardly end."""
     if encoded.count(b"\xff\xda") > limits.MAX_PICTURE_SCANS:
         raise OSError(f"more than {limits.MAX_PICTURE_SCANS} scans")
 
 
 def decode(encoded: bytes, shape: tuple[int, ...] | None = None) -> np.ndarray:
-    """Decode a JPEG or PNG file to (H, W, 3) uint8; ``shape`` is the one that it must have.
+    """Decode a JPEG or PNG file to (H, W, 3) uint8; ``shape`` is the required one.
 
     Raises:
         OSError: it is no picture of these formats, damaged, larger than allowed, or of another shape.
@@ -88,12 +88,14 @@ def decode(encoded: bytes, shape: tuple[int, ...] | None = None) -> np.ndarray:
 
 @contextmanager
 def _opened_within(encoded: bytes, shape: tuple[int, ...] | None) -> Iterator[Image.Image]:
-    """A picture whose header is as :func:`decode` wants it; its content has not been looked at."""
+    """A picture whose header satisfies :func:`decode`; its content is not checked."""
     check_scans(encoded)
     with open_image(io.BytesIO(encoded)) as image:
         size = (image.height, image.width)
         if max(size) > limits.MAX_PICTURE_SIDE:
-            raise OSError(f"{image.width} x {image.height} pixels; at most {limits.MAX_PICTURE_SIDE} a side")
+            raise OSError(
+                f"{image.width} x {image.height} pixels; at most {limits.MAX_PICTURE_SIDE} per side"
+            )
         if shape is not None and shape[:2] != size:
             raise OSError(f"{size} in size, and state 0 is {shape[:2]}")
         yield image
@@ -133,7 +135,7 @@ def look(file: h5py.File, num_states: int | None) -> tuple[tuple[int, int, int] 
     if name == _RAW:
         if max(shape[1:3]) > limits.MAX_PICTURE_SIDE:
             most = limits.MAX_PICTURE_SIDE
-            return None, [f"{held}; make the pictures smaller, at most {most} pixels a side"]
+            return None, [f"{held}; make the pictures smaller, at most {most} pixels per side"]
         return (shape[1], shape[2], 3), []
     try:
         height, width, _ = decode(dataset[0].tobytes()).shape
@@ -160,7 +162,7 @@ def read_pictures(path: Path, ids: np.ndarray) -> np.ndarray:
             raise SceneError(f"{path}: there is no state {wrong}; the states are 0..{len(dataset) - 1}")
         if name == _RAW:
             return dataset[states][back]
-        # One at a time: entries can share their bytes in the file, and would not share them in memory.
+        # One at a time: entries can share bytes in the file, but not in memory.
         try:
             state = 0
             first = decode(dataset[0].tobytes())
@@ -173,7 +175,7 @@ def read_pictures(path: Path, ids: np.ndarray) -> np.ndarray:
 
 
 def raw_blocks(path: Path, states: np.ndarray) -> Iterator[np.ndarray]:
-    """The pictures of the states (n,) in order, some (n, H, W, 3) at a time."""
+    """Blocks (n, H, W, 3) of the pictures of the states, in order."""
     size = read_pictures(path, states[:1]).nbytes
     at_once = max(1, min(_AT_ONCE, limits.MAX_PICTURE_BYTES // max(size, 1)))
     for first in range(0, len(states), at_once):
@@ -181,17 +183,17 @@ def raw_blocks(path: Path, states: np.ndarray) -> Iterator[np.ndarray]:
 
 
 def check(path: Path, num_states: int, most: int | None = None) -> None:
-    """Check the pictures of a file: the header and the end of each, then what decoding finds.
+    """Check the pictures of a file: the header and the end of each, then by decoding.
 
-    What is cut off, of another size or no picture is thus found in seconds, in a file of any size.
+    Truncated pictures, other sizes and other data are thus found in seconds, in a file of any size.
 
     Args:
         path: the file.
         num_states: N.
-        most: how many are decoded, evenly spaced; None for all.
+        most: number of pictures to decode, evenly spaced; None for all.
 
     Raises:
-        SceneError: naming the first picture that cannot be used.
+        SceneError: a picture cannot be used; the message names the first one.
     """
     with opened(path) as file:
         name, dataset = _find(file) or ("", None)
@@ -202,7 +204,7 @@ def check(path: Path, num_states: int, most: int | None = None) -> None:
                 for state in range(len(dataset)):
                     encoded = dataset[state].tobytes()
                     with _opened_within(encoded, shape) as image:
-                        if not encoded.rstrip(b"\0").endswith(_ENDS):  # cut off, or with something behind it
+                        if not encoded.rstrip(b"\0").endswith(_ENDS):  # truncated, or with trailing data
                             image.load()
             except OSError as error:
                 raise _unusable(path, state, error) from error
@@ -216,7 +218,7 @@ def _unusable(path: Path, state: int, error: OSError) -> SceneError:
 
 
 def stored(path: Path, num_states: int) -> tuple[list[bytes] | None, Iterator[np.ndarray] | None]:
-    """The pictures of a file as they are stored: JPEG files or blocks of raw ones, None for the others."""
+    """Pictures of a file as they are stored: JPEG files, or blocks of raw pictures; the other one is None."""
     with opened(path) as file:
         found = _find(file)
         if found is None:
@@ -242,7 +244,7 @@ def write_jpegs(file: h5py.File, jpegs: Sequence[bytes]) -> None:
 
 
 def write_raw(file: h5py.File, blocks: Iterable[np.ndarray], num_states: int) -> None:
-    """Write ``observation`` from blocks of (n, H, W, 3) uint8 that make N pictures together."""
+    """Write ``observation`` from blocks of (n, H, W, 3) uint8 with N pictures in all."""
     first = 0
     for block in blocks:
         if first == 0:

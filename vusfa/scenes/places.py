@@ -1,4 +1,4 @@
-"""Where scenes are: bundled names, files, folders of files, and patterns."""
+"""Locations of scenes: bundled names, files, folders of files, and patterns."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ _SUFFIXES = (".h5", ".hdf5")
 
 def expanded(scenes: str | os.PathLike[str] | Sequence[str | os.PathLike[str]]) -> list[Any]:
     """Names and files, in order: a folder (``rooms/``) stands for its files ``*.h5`` and ``*.hdf5``, and a
-    pattern (``rooms/*_small.h5``) for the files that match it, both by name.
+    pattern (``rooms/*_small.h5``) for the files that match it, both sorted by name.
 
     Raises:
-        SceneError: a folder without scene files, or a pattern that no file matches.
+        SceneError: a folder has no scene files, or no file matches a pattern.
 
     >>> expanded(["bathroom", "my_room.h5"])
     ['bathroom', 'my_room.h5']
@@ -62,7 +62,7 @@ def open_scenes(scenes: Any, skip_broken: bool = False) -> tuple[list[str], list
     times = Counter(scene.name for scene in opened)
     for source, scene in zip(sources, opened, strict=True):
         if times[scene.name] > 1 and Path(source).suffix:
-            object.__setattr__(scene, "name", Path(source).stem)  # nobody else holds it yet
+            object.__setattr__(scene, "name", Path(source).stem)  # no other reference exists yet
     return sources, opened
 
 

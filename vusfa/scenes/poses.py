@@ -1,4 +1,4 @@
-"""Geometry of a scene's poses: distance between places, and a selection of poses spread over the room."""
+"""Geometry of a scene's poses: distances between places, and poses spread over the room."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ def places(location: Tensor) -> Tensor:
 
 
 def dart(heading: float = 0.0) -> list[tuple[float, float]]:
-    """Corners of the dart that stands for a pose on maps, about its middle; y downwards, at most 1 away.
+    """Corners of the dart that marks a pose on maps, relative to its centre; y downwards, at most 1 away.
 
     Args:
-        heading: degrees that it points to, 0 = up, 90 = right.
+        heading: degrees, 0 = up, 90 = right.
 
     >>> dart(90.0)[0]
     (1.0, -0.0)
@@ -32,7 +32,7 @@ def dart(heading: float = 0.0) -> list[tuple[float, float]]:
 
 
 def step_length(location: Tensor) -> float:
-    """Distance between neighbouring places, in the unit of ``location`` (N, 2); 1 where all are one place.
+    """Distance between neighbouring places, in the unit of ``location`` (N, 2); 1 if there is only one place.
 
     >>> step_length(torch.tensor([[0.0, 0.0], [0.0, 0.5], [1.0, 0.5], [0.0, 0.5]]))
     0.5
@@ -40,15 +40,15 @@ def step_length(location: Tensor) -> float:
     distinct = places(location)
     if len(distinct) == 1:
         return 1.0
-    # the other mode, by matrix products, finds places 2 mm from themselves
+    # with matrix products a place would be 2 mm from itself
     apart = torch.cdist(distinct[:256], distinct, compute_mode="donot_use_mm_for_euclid_dist")
     return float(apart[apart > 1e-3].min())
 
 
 def spread_poses(location: Tensor, rotation: Tensor, count: int) -> list[int]:
-    """Farthest-point selection of states, by place and heading, beginning nearest to the middle.
+    """Farthest-point selection of states, by place and heading, starting nearest to the centre.
 
-    Opposite headings count as far apart as half of the room.
+    Opposite headings count as half of the room apart.
 
     Args:
         location: (N, 2) metres.
@@ -56,7 +56,7 @@ def spread_poses(location: Tensor, rotation: Tensor, count: int) -> list[int]:
         count: number of states; all of them when there are fewer.
 
     Returns:
-        state ids in the order of their choice, no repeats.
+        distinct state ids in order of selection.
 
     >>> row = torch.tensor([[0.0, 0.0], [0.0, 1.0], [0.0, 2.0], [0.0, 3.0], [0.0, 4.0]])
     >>> spread_poses(row, torch.zeros(5), 3)
@@ -64,14 +64,14 @@ def spread_poses(location: Tensor, rotation: Tensor, count: int) -> list[int]:
     """
     extent = float((location.amax(0) - location.amin(0)).max()) or 1.0
     angle = rotation * (math.pi / 180)
-    # a unit vector for each heading, so that 0 and 360 are the same; opposite ones are 2 apart
+    # one unit vector per heading, so that 0 and 360 are the same; opposite ones are 2 apart
     heading = torch.stack([angle.sin(), angle.cos()], 1) * (extent / 4)
     pose = torch.cat([location, heading], 1).double()
     middle = torch.cat([location.mean(0), heading[0]]).double()
     chosen = [int((pose - middle).norm(dim=1).argmin())]
     nearest = (pose - pose[chosen[0]]).norm(dim=1)
     while len(chosen) < min(count, len(pose)):
-        # never one that was chosen, even where several states share a pose
+        # exclude chosen states, even where several states share a pose
         nearest[chosen] = -1.0
         chosen.append(int(nearest.argmax()))
         nearest = torch.minimum(nearest, (pose - pose[chosen[-1]]).norm(dim=1))

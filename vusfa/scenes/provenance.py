@@ -1,7 +1,7 @@
 """Provenance of a scene: who made it, with what, from which plan and seed, under which licences.
 
 One attribute of the scene's file per field of :class:`Provenance`, in :attr:`vusfa.scenes.Scene.attributes`
-beside whatever else its maker wrote there.
+beside its maker's other attributes.
 """
 
 from __future__ import annotations
@@ -25,11 +25,11 @@ class Provenance:
     Args:
         made_with: tools and their versions, as :func:`this_tool` writes them.
         made_by: a person or a group.
-        made_on: a day, 2026-11-23.
-        plan: the room's plan as YAML text, or where it can be found.
-        seed: of whatever was random.
-        licences: one line per part with a licence of its own.
-        credits: whom to name wherever the pictures are shown.
+        made_on: a date, 2026-11-23.
+        plan: the room's plan as YAML text, or its location.
+        seed: random seed.
+        licences: one line per separately licensed part.
+        credits: people to credit wherever the pictures are shown.
 
     >>> origin = Provenance("vusfa 0.1.0 scenes from-photos", seed=3, credits=("Photographs: A. Fan",))
     >>> origin.attributes()
@@ -48,7 +48,7 @@ class Provenance:
 
     @classmethod
     def of(cls, attributes: Mapping[str, Any]) -> Provenance:
-        """The origin in a scene's attributes, as far as they tell it.
+        """Read the origin from a scene's attributes; fields that they lack are empty.
 
         >>> Provenance.of({"seed": 1, "licences": "CC0", "exposure": 2.2})
         Provenance(made_with=None, ..., seed=1, licences=('CC0',), credits=())
@@ -61,13 +61,13 @@ class Provenance:
         return cls(**values)
 
     def attributes(self) -> dict[str, Any]:
-        """As attributes of a scene: ``Scene(..., attributes={**origin.attributes(), ...})``."""
+        """Attributes of a scene: ``Scene(..., attributes={**origin.attributes(), ...})``."""
         values = {name: getattr(self, name) for name in _NAMES}
         return {k: list(v) if isinstance(v, tuple) else v for k, v in values.items() if v not in (None, ())}
 
     @staticmethod
     def other(attributes: Mapping[str, Any]) -> dict[str, Any]:
-        """The attributes that are no part of the origin.
+        """Attributes that are not part of the origin.
 
         >>> Provenance.other({"seed": 1, "exposure": 2.2})
         {'exposure': 2.2}
@@ -79,7 +79,7 @@ _NAMES = tuple(field.name for field in dataclasses.fields(Provenance))
 
 
 def this_tool(command: str, **versions: str) -> str:
-    """A value for ``made_with``: this package, the command, and what else had a part in it.
+    """A value for ``made_with``: this package, the command, and the other tools with their versions.
 
     >>> this_tool("scenes render", mitsuba="3.9.1")
     'vusfa ... scenes render, mitsuba 3.9.1'
@@ -88,7 +88,7 @@ def this_tool(command: str, **versions: str) -> str:
 
 
 def today() -> str:
-    """A value for ``made_on``: the day in UTC, or that of $SOURCE_DATE_EPOCH for reproducible files."""
+    """A value for ``made_on``: the date in UTC, or that of $SOURCE_DATE_EPOCH for reproducible files."""
     epoch = os.environ.get("SOURCE_DATE_EPOCH")
     moment = datetime.now(UTC) if epoch is None else datetime.fromtimestamp(int(epoch), UTC)
     return moment.strftime("%Y-%m-%d")

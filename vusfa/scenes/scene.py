@@ -1,7 +1,7 @@
 """One scene: a room as a finite graph of photographed poses.
 
 A state is a pose (a place and a heading) with its picture's features; an action leads to another state or is
-blocked. No file stays open: a scene can be pickled, forked and spawned, and pictures are read when asked for.
+blocked. No file stays open: a scene can be pickled, forked and spawned, and pictures are read on request.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ __all__ = ["Scene"]
 
 
 class _Distance:
-    """The field ``Scene.distance``: what was given, until it is checked; then a table made on request."""
+    """The field ``Scene.distance``: the given table, until it is checked; then a table made on request."""
 
     def __get__(self, scene: Scene | None, owner: type) -> Any:
         return None if scene is None else scene._paths.table
@@ -50,7 +50,7 @@ class Scene:
         location: (N, 2) metres; zeros when not given.
         rotation: (N,) degrees; zeros when not given.
         distance: (N, N) integers, ``[s, g]`` actions from s to g, -1 = unreachable; checked against the
-            graph. When not given, the table is made when it is asked for, of at most 16,384 states;
+            graph. When not given, the table is made on request, for at most 16,384 states;
             :meth:`distances_to` needs none.
         actions: A names; those of the THOR v1 dumps when not given and A is 4.
         attributes: provenance: str, int, float, or lists of these.
@@ -103,7 +103,7 @@ class Scene:
         self._set(arrays, actions)
 
     def _set(self, arrays: dict[str, np.ndarray], actions: tuple[str, ...] | None) -> None:
-        """Set the fields from arrays that are sound, and are the scene's own from now on."""
+        """Set the fields from checked arrays, which the scene then owns."""
         graph = _tensor(arrays["graph"], np.int64)
         values = {
             "graph": graph,
@@ -113,7 +113,7 @@ class Scene:
             "_paths": ShortestPaths(graph.numpy(), arrays.get("shortest_path_distance")),
             "actions": actions or default_actions(arrays["graph"].shape[1]),
             "attributes": dict(self.attributes),
-            # Workers may run in another folder.
+            # Workers may run in another working directory.
             "path": None if self.path is None else Path(self.path).resolve(),
         }
         for key, value in values.items():
@@ -121,10 +121,10 @@ class Scene:
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Scene:
-        """Read and check a scene file; the file is closed again when this returns.
+        """Read and check a scene file; the file is closed on return.
 
         Raises:
-            SceneError: the file is missing, truncated or has faults; the message lists every one of them.
+            SceneError: the file is missing, truncated or has faults; the message lists all of them.
         """
         dump = store.read(path)
         raise_faults(path, dump.faults())
@@ -132,7 +132,7 @@ class Scene:
         fields = {"attributes": dump.attributes, "path": Path(path), "picture_shape": dump.picture_shape}
         for key, value in {"name": dump.name, **fields}.items():
             object.__setattr__(scene, key, value)
-        scene._set(dump.arrays, dump.actions)  # without another copy, and without looking at them again
+        scene._set(dump.arrays, dump.actions)  # without another copy or check
         return scene
 
     @classmethod
@@ -154,7 +154,7 @@ class Scene:
         A string without suffix and folder is a bundled name, anything else a file.
 
         Raises:
-            SceneError: neither a bundled name nor a file, or a file with faults.
+            SceneError: there is no such scene or file, or the file has faults.
         """
         if isinstance(source, str) and not Path(source).suffix and os.sep not in source:
             if source in store.bundled_names():
@@ -171,9 +171,9 @@ class Scene:
     def save(
         self, path: str | os.PathLike[str], pictures: Tensor | np.ndarray | Sequence[bytes] | None = None
     ) -> None:
-        """Write the scene, atomically; what is read back is equal, number for number.
+        """Write the scene, atomically; :meth:`load` reads exactly equal numbers.
 
-        What else the scene's own file holds (further datasets, attributes of datasets) is copied along.
+        Other entries of the scene's file (further datasets, attributes of datasets) are copied, too.
 
         Args:
             path: file to write; replaced if it exists.
@@ -202,7 +202,7 @@ class Scene:
         )
 
     def pictures(self, ids: Any) -> Tensor:
-        """Pictures of some states, read from the scene's file now.
+        """Read the pictures of some states from the scene's file.
 
         Args:
             ids: state ids of any shape, in any order, repeats allowed.
@@ -222,7 +222,7 @@ class Scene:
         return found.reshape(*states.shape, *found.shape[1:])
 
     def distances_to(self, goals: Any) -> Tensor:
-        """Lengths of the shortest paths from every state to some goals, searched when first asked for.
+        """Lengths of the shortest paths from every state to some goals, searched on first request.
 
         Args:
             goals: one state id, or (G,).
@@ -253,7 +253,7 @@ class Scene:
         return self._paths.between(state, goal)
 
     def __getstate__(self) -> dict[str, Any]:
-        return {**vars(self), "features": self.features.numpy()}  # not the table of a set that it is part of
+        return {**vars(self), "features": self.features.numpy()}  # not the table shared with a set
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         vars(self).update(state, features=torch.from_numpy(state["features"]))
@@ -263,7 +263,7 @@ class Scene:
 
     @property
     def has_pictures(self) -> bool:
-        """Whether :meth:`pictures` can give any."""
+        """Whether the scene has pictures."""
         return self.picture_shape is not None
 
     @property
@@ -288,7 +288,7 @@ class Scene:
 
     @cached_property
     def islands(self) -> tuple[tuple[int, ...], ...]:
-        """States cut off from the largest connected part, a sorted tuple for each island; often empty.
+        """States cut off from the largest connected part, one sorted tuple per island; often empty.
 
         >>> Scene("two parts", torch.tensor([[1], [0], [0], [3]]), torch.rand(4, 1, 2)).islands
         ((3,),)

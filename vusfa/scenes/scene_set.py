@@ -1,6 +1,6 @@
 """Several scenes as one space of state ids: scene i has the ids ``offsets[i] .. offsets[i + 1] - 1``.
 
-Environments and networks hold these integers and look everything else up here.
+Environments and networks hold these integers and look up everything else here.
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ class SceneSet:
         self._build()
 
     def _build(self) -> None:
-        # NumPy on purpose: torch's threads hang in a forked process whose parent has used them.
+        # NumPy: torch's threads hang in a forked process whose parent has used them.
         sizes = [scene.num_states for scene in self.scenes]
         offsets = np.cumsum([0, *sizes])
         tables = [successor_table(scene.graph) for scene in self.scenes]
@@ -93,14 +93,14 @@ class SceneSet:
     ) -> SceneSet:
         """Open bundled names and files alike: ``SceneSet.open(["bathroom", "my_room.h5"])``.
 
-        Scenes of one name, such as rooms of one kind from several seeds, are renamed after their files.
+        Scenes of the same name, such as rooms of a kind from several seeds, are renamed after their files.
 
         Args:
             scenes: names, files, folders of scene files (``rooms/``) and patterns (``rooms/*_small.h5``).
-            skip_broken: leave files with faults out, with a warning that names them.
+            skip_broken: leave out files with faults, with a warning that names them.
 
         Raises:
-            SceneError: neither a bundled name nor a file, or a file with faults.
+            SceneError: there is no such scene or file, or the file has faults.
 
         >>> SceneSet.open("kitchen").num_states
         680
@@ -122,7 +122,7 @@ class SceneSet:
 
     @property
     def num_states(self) -> int:
-        """S, the states of all scenes together."""
+        """S, the number of states of all scenes."""
         return self.successor.shape[0]
 
     @property
@@ -147,15 +147,15 @@ class SceneSet:
 
     @property
     def device(self) -> torch.device:
-        """Where the tables are."""
+        """Device of the tables."""
         return self.successor.device
 
     @property
     def distance_tables(self) -> tuple[Tensor, Tensor]:
-        """The scenes' tables (N, N) of shortest paths, flat, one after the other; made anew at each call.
+        """The scenes' tables (N, N) of shortest paths, flattened and concatenated; made at each call.
 
-        Entry ``first[i] + s * N + g`` of the first tensor is the actions from s to g, in scene i's own ids;
-        the second tensor is ``first``, (n_scenes + 1,). A single scene's is shared, not copied.
+        Entry ``first[i] + s * N + g`` of the first tensor is the distance from s to g, local ids, in actions.
+        The second tensor is ``first``, (n_scenes + 1,). A single scene's table is shared, not copied.
         """
         tables = [scene.distance.numpy().ravel() for scene in self.scenes]
         first = torch.from_numpy(np.cumsum([0, *(len(table) for table in tables)]))
@@ -180,7 +180,7 @@ class SceneSet:
         return found.to(self.device)
 
     def scene_index(self, scene: str | int) -> int:
-        """Index of a scene by its name, or its index checked.
+        """Index of a scene, given by name or by index.
 
         Raises:
             SceneError: there is no such scene.
@@ -194,7 +194,7 @@ class SceneSet:
         return int(scene)
 
     def global_id(self, scene: str | int, local: Any) -> Tensor:
-        """Global ids of local state ids, of any shape, of a scene, given by name or index.
+        """Global ids of a scene's local ids, of any shape; the scene is given by name or index.
 
         Raises:
             SceneError: there is no such scene or state.
@@ -223,7 +223,7 @@ class SceneSet:
         return ids - self.offsets[self.scene_id[ids]]
 
     def pictures(self, ids: Any) -> Tensor:
-        """Pictures of states, read from the scenes' files now.
+        """Read the pictures of states from the scenes' files.
 
         Args:
             ids: global ids of any shape.
@@ -232,7 +232,7 @@ class SceneSet:
             (*ids.shape, H, W, 3) uint8 on the CPU.
 
         Raises:
-            SceneError: no such state, a scene without pictures, or pictures of different sizes.
+            SceneError: a state does not exist, a scene has no pictures, or their sizes differ.
         """
         ids = torch.as_tensor(ids, dtype=torch.int64).cpu()
         flat = ids.reshape(-1).numpy()
@@ -279,7 +279,7 @@ class SceneSet:
         return self._fingerprint
 
     def __getstate__(self) -> dict[str, Any]:
-        # The tables repeat what the scenes hold: send the scenes alone, build the tables again.
+        # Send the scenes only; the tables are rebuilt from them.
         return {"scenes": self.scenes, "device": str(self.device)}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
@@ -292,5 +292,5 @@ class SceneSet:
 
 
 def _joined(arrays: list[np.ndarray]) -> Tensor:
-    """All arrays in one; a single one is shared, not copied."""
+    """Concatenated arrays; a single one is shared, not copied."""
     return torch.from_numpy(np.concatenate(arrays) if len(arrays) > 1 else arrays[0])

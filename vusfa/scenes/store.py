@@ -3,13 +3,13 @@
 | dataset | content |
 |---|---|
 | graph (N, A) | next state, -1 = blocked; any integers |
-| resnet_feature (N, C, F) | features of each state's C crops, whatever network they come from; any floats |
+| resnet_feature (N, C, F) | features of each state's C crops, of any network; any floats |
 | location (N, 2), rotation (N,) | metres, degrees |
-| shortest_path_distance (N, N) | in actions, -1 = unreachable; any integers; not read of over 4096 states |
+| shortest_path_distance (N, N) | in actions, -1 = unreachable; any integers; not read above 4096 states |
 | observation, or observation_jpeg | optional: the pictures, see :mod:`vusfa.scenes.pictures` |
 
-Attributes carry the provenance; of these, ``scene`` and ``actions`` are the scene's name and the names of its
-actions. Every function opens the file, does its work and closes it, so that scenes can be forked and pickled.
+Attributes hold the provenance; ``scene`` and ``actions`` are the scene's name and the names of its actions.
+Every function closes the file before it returns, so that scenes can be forked and pickled.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ class Dump:
         actions: attribute ``actions``, or None.
         attributes: all other attributes as plain Python values.
         picture_shape: (H, W, 3), or None without usable pictures.
-        reading_faults: what could not be read, one line each, without the file's name.
+        reading_faults: faults met while reading, one line each, without the file's name.
     """
 
     name: str
@@ -66,7 +66,7 @@ class Dump:
     reading_faults: list[str] = field(default_factory=list)
 
     def faults(self) -> list[str]:
-        """All faults, those of the values too."""
+        """All faults, including those of the values."""
         unreadable = [name for name in DATASETS if any(f"{name!r}" in line for line in self.reading_faults)]
         return self.reading_faults + array_faults(self.arrays, self.actions, optional=unreadable)
 
@@ -144,12 +144,12 @@ def read(path: str | os.PathLike[str]) -> Dump:
 def validate(path: str | os.PathLike[str], most_pictures: int | None = None) -> list[str]:
     """All faults of a scene file at once; an empty list for a sound file.
 
-    Each line names the file, the dataset, the state and the mend.
+    Each line names the file, the dataset, the state and the remedy.
 
     Args:
         path: the file.
-        most_pictures: how many pictures are decoded, evenly spaced; None for every one. The header and the
-            end of every picture are looked at first.
+        most_pictures: number of pictures to decode, evenly spaced; None for all. The header and the end of
+            every picture are checked first.
 
     >>> validate(bundled_path("bathroom"))
     []
@@ -179,7 +179,7 @@ def _smallest_integer(values: np.ndarray) -> np.dtype:
 
 
 def _smallest_float(values: np.ndarray) -> np.dtype:
-    """float16 where that holds every value exactly, else float32: what is read back is what was given."""
+    """float16 if it holds every value exactly, otherwise float32: reading gives the same values."""
     with np.errstate(over="ignore"):
         exact = all((values[rows].astype(np.float16) == values[rows]).all() for rows in row_blocks(values))
     return np.dtype(np.float16 if exact else np.float32)
@@ -221,7 +221,7 @@ def write(
     """Write a scene file, atomically.
 
     Integers take the smallest type that holds them; features are float16 where that is exact, else float32.
-    Everything but the JPEG files is compressed and carries checksums. The same content gives the same bytes.
+    Everything except the JPEG files is compressed and has checksums. The same content gives the same bytes.
 
     Args:
         path: file to write; replaced if it exists.
@@ -231,12 +231,12 @@ def write(
         actions: A names.
         attributes: provenance.
         pictures: (N, H, W, 3) uint8, or N JPEG files; None copies those of ``source`` as they are.
-        source: the scene's file so far. What else it holds is copied, see
+        source: the scene's previous file. Its other entries are copied, see
             :func:`vusfa.scenes.hdf5.copy_others`.
         stale: datasets with new content, whose attributes in ``source`` are not copied.
 
     Raises:
-        SceneError: the file cannot be written, an attribute has no place in it, or the pictures do not fit.
+        SceneError: the file or an attribute cannot be written, or the pictures do not fit.
     """
     path = Path(path)
     num_states = len(arrays["graph"])
@@ -254,7 +254,7 @@ def write(
                 f"{path}: pictures are {pictures.dtype} of shape {pictures.shape}; give uint8 (N, H, W, 3)"
             )
     if pictures is not None and len(pictures) != num_states:
-        raise SceneError(f"{path}: {len(pictures)} pictures for {num_states} states; give one for each")
+        raise SceneError(f"{path}: {len(pictures)} pictures for {num_states} states; give one per state")
     with replaced(path) as file:
         _write_attributes(file, {**attributes, "scene": name, "actions": list(actions)})
         for key in (name for name in DATASETS if name in kinds):

@@ -1,7 +1,7 @@
 """Validation of a scene's arrays.
 
-Pure functions that return lists of faults, one line per kind: the dataset, the first state concerned, how
-many there are, and the mend. Islands (states that some others cannot reach) are no fault, see
+Pure functions that return lists of faults, one line per kind: the dataset, the first state concerned, the
+number of states, and the remedy. Islands (states that some others cannot reach) are no fault, see
 :attr:`vusfa.scenes.Scene.islands`.
 """
 
@@ -45,7 +45,7 @@ DATASETS: dict[str, tuple[str, str, str]] = {
 
 
 def raise_faults(source: str | os.PathLike[str], faults: Sequence[str]) -> None:
-    """Raise one SceneError that lists all faults of a scene; do nothing where there are none.
+    """Raise one SceneError that lists all faults of a scene, if there are any.
 
     >>> raise_faults("room.h5", ["dataset 'graph' is missing", "dataset 'location' is missing"])
     Traceback (most recent call last):
@@ -68,7 +68,7 @@ def _how_many(count: int) -> str:
 
 
 def shape_fault(name: str, values: np.ndarray, num_states: int) -> str | None:
-    """The fault of a dataset, one of :data:`DATASETS`, whose dtype or shape does not fit N states; or None.
+    """Fault of a dataset of :data:`DATASETS` whose dtype or shape does not fit N states; None without one.
 
     >>> shape_fault("graph", np.zeros((3, 4), np.float32), 3)
     "dataset 'graph' holds float32 of shape (3, 4); write it as integers (N, A)"
@@ -89,7 +89,7 @@ def shape_fault(name: str, values: np.ndarray, num_states: int) -> str | None:
 
 
 def graph_faults(graph: np.ndarray, actions: Sequence[str] | None = None) -> list[str]:
-    """Successors that are neither a state nor -1; action names that do not fit the columns.
+    """Faults of a graph: successors that are neither a state nor -1, action names that do not fit.
 
     >>> graph_faults(np.array([[1, -1], [7, 0]]))[0]
     "dataset 'graph', state 1: action 0 leads to 7, but states are 0..1 (-1 is a blocked move); correct it"
@@ -112,7 +112,7 @@ def graph_faults(graph: np.ndarray, actions: Sequence[str] | None = None) -> lis
 
 
 def feature_faults(features: np.ndarray) -> list[str]:
-    """Features that are NaN, infinite, or too large for float32.
+    """Faults of features: NaN, infinity, or values too large for float32.
 
     >>> feature_faults(np.array([[[1.0]], [[np.nan]]]))
     ["dataset 'resnet_feature', state 1: crop 0, feature 0 is nan; compute the features of this state again"]
@@ -132,7 +132,7 @@ def feature_faults(features: np.ndarray) -> list[str]:
 
 
 def pose_faults(name: str, values: np.ndarray) -> list[str]:
-    """Locations (metres) or rotations (degrees) that are NaN or infinite.
+    """Faults of locations (metres) or rotations (degrees): NaN or infinity.
 
     >>> pose_faults("rotation", np.array([0.0, np.nan, np.inf]))
     ["dataset 'rotation', state 1 (the first of 2): nan is not finite; give every state a pose"]
@@ -148,9 +148,9 @@ def pose_faults(name: str, values: np.ndarray) -> list[str]:
 
 
 def distance_faults(graph: np.ndarray, distance: np.ndarray) -> list[str]:
-    """A distance that disagrees with a breadth-first search of the graph.
+    """Fault of distances: one that differs from a breadth-first search of the graph.
 
-    A table is right exactly when it has 0 on the diagonal and ``d(s, g) = 1 + min_a d(next(s, a), g)``
+    A table is correct if and only if it has 0 on the diagonal and ``d(s, g) = 1 + min_a d(next(s, a), g)``
     elsewhere (Bellman's equation), which takes a fraction of the time of searches from every state.
 
     >>> distance_faults(np.array([[1], [-1]]), np.array([[0, 2], [-1, 0]]))[0].split(";")[0]
@@ -204,14 +204,14 @@ def array_faults(
     Args:
         arrays: the datasets of :data:`DATASETS` by name.
         actions: names of the graph's columns, where they are given.
-        optional: datasets that may be missing without fault.
+        optional: datasets that may be missing.
 
     >>> array_faults({"graph": np.zeros((2, 1), int)}, optional=["location", "rotation", "resnet_feature"])
     ["dataset 'shortest_path_distance' is missing; write it as integers (N, N)"]
     """
     faults = []
     sound = {}
-    # Should the graph itself be unusable, the first dataset there is tells how many states there are.
+    # If the graph is unusable, the first usable dataset gives the number of states.
     num_states = next((len(arrays[name]) for name in DATASETS if name in arrays and arrays[name].ndim), 0)
     for name, (shape, _, kinds_name) in DATASETS.items():
         if name in arrays:
@@ -239,7 +239,7 @@ def check_alike(scenes: Sequence[Scene]) -> None:
     """Check that scenes can form one set.
 
     Raises:
-        SceneError: two of one name, or scenes that differ in actions, crops or feature size.
+        SceneError: two have the same name, or scenes that differ in actions, crops or feature size.
     """
     name, times = Counter(scene.name for scene in scenes).most_common(1)[0]
     if times > 1:

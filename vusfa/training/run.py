@@ -113,5 +113,5 @@ def _with_whereabouts(error: VusfaError, trainer: Trainer, checkpoint: Path, log
         loggers.log_checkpoint(trainer.save(checkpoint), trainer.frames)
         return type(error)(f"{error}; all {trainer.frames:,} frames are in {checkpoint}: resume it")
     except VusfaError:
-        kept = f"{checkpoint} is as it was" if checkpoint.is_file() else "there is no checkpoint yet"
+        kept = f"resume from {checkpoint}" if checkpoint.is_file() else "there is no checkpoint yet"
         return type(error)(f"{error}; {kept}")

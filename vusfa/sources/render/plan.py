@@ -29,16 +29,16 @@ __all__ = [
     "Zone",
 ]
 
-#: What a piece of furniture may be: it stands, lies on another, is walked over, hangs from the ceiling, ...
+#: Roles of furniture: standing, lying on another piece, walked over, hanging from the ceiling, ...
 ROLES = ("floor", "top", "rug", "lamp", "hung", "door")
 
-# Whatever hangs higher than this does not stand in the way.
+# What hangs higher than this does not block the way.
 _HEADROOM = 1.9
 
 
 @dataclass(frozen=True)
 class Solid:
-    """A block of wall. ``bottom`` above 1.9 m makes it a lintel, which one walks under."""
+    """A block of wall; with ``bottom`` above 1.9 m a lintel, which does not block the way."""
 
     rect: Rect
     bottom: float = 0.0
@@ -46,7 +46,7 @@ class Solid:
 
 @dataclass(frozen=True)
 class Zone:
-    """A part of the floor with a pattern of its own."""
+    """A part of the floor with its own pattern."""
 
     rect: Rect
     floor: str
@@ -58,9 +58,9 @@ class Surfaces:
 
     Args:
         floor: wood, tile or check.
-        seed: draws the colors and the grain, and the walls' patterns where none are named; also which
-            frames the exposure is measured from.
-        walls: patterns, one after the other for :meth:`Plan.walls`, from the start again when they run out:
+        seed: random seed of the colors, the grain, the walls' patterns where none are named, and the frames
+            from which the exposure is measured.
+        walls: patterns of :meth:`Plan.walls`, in order, repeated when they run out:
             stripe, wainscot, brick, plain, dots, tile, chevron, plank, diamond.
         zones: floors that differ from ``floor``, such as those of a flat's rooms.
     """
@@ -73,16 +73,16 @@ class Surfaces:
 
 @dataclass(frozen=True)
 class Furniture:
-    """A model of the catalogue in its place.
+    """A placed model of the catalogue.
 
     Args:
-        model: such as ``Scopia#5``.
+        model: its name, such as ``Scopia#5``.
         at: (x, z) of the middle of its footprint.
-        facing: where its front looks.
-        elevation: of its underside; the catalogue's when left out.
-        size: (width, height, depth); the catalogue's when left out.
+        facing: heading of its front.
+        elevation: height of its underside; the catalogue's by default.
+        size: (width, height, depth); the catalogue's by default.
         role: one of :data:`ROLES`.
-        blocks: whether one cannot walk through its footprint.
+        blocks: whether its footprint blocks the way.
     """
 
     model: str
@@ -105,7 +105,7 @@ class Furniture:
 
 @dataclass(frozen=True)
 class Picture:
-    """A painted picture at a place on a wall; ``height`` is that of its middle, ``size`` (width, height)."""
+    """A painted picture at a place on a wall; ``height`` is that of its centre, ``size`` (width, height)."""
 
     at: tuple[float, float]
     facing: float
@@ -141,13 +141,13 @@ class Light:
 
 @dataclass(frozen=True)
 class Grid:
-    """Where the camera can be.
+    """Grid of the camera's places.
 
     Args:
-        step: between neighbouring places.
+        step: distance between neighbouring places.
         origin: the first place; the others follow from it by steps to the right and forward.
-        headings: 4, or 8 to walk diagonally too.
-        radius: of the walker's body, which must clear walls and furniture.
+        headings: 4, or 8 for diagonal moves, too.
+        radius: size of the agent's body, which must clear walls and furniture.
     """
 
     step: float = 0.5
@@ -160,8 +160,8 @@ class Grid:
 class Camera:
     """The camera: ``height`` above the floor, ``pitch`` degrees down, ``fov`` degrees wide.
 
-    ``resolution`` is (width, height) in pixels, ``samples`` the paths of light per pixel before denoising,
-    ``exposure`` the factor on brightness (measured from some frames when left out).
+    ``resolution`` is (width, height) in pixels, ``samples`` the light paths per pixel before denoising,
+    ``exposure`` the factor on brightness (measured from some frames by default).
     """
 
     height: float = 1.4
@@ -176,7 +176,7 @@ class Camera:
 class Plan:
     """A room. ``size`` is (width, depth, height of the ceiling).
 
-    ``kind`` and ``seed`` say what a drawn plan was drawn from.
+    ``kind`` and ``seed`` are those from which a plan was drawn.
 
     >>> from vusfa.sources.render.plan import Furniture, Plan
     >>> plan = Plan("cell", size=(3.0, 3.0, 2.6), furniture=(Furniture("Scopia#5", (1.5, 1.5)),))
@@ -199,19 +199,19 @@ class Plan:
 
     @property
     def walls(self) -> list[Wall]:
-        """Visible pieces of wall, lintels apart: the order in which ``surfaces.walls`` are used."""
+        """Visible pieces of wall without lintels, in the order of ``surfaces.walls``."""
         standing = [solid.rect for solid in self.solids if solid.bottom < _HEADROOM]
         return wall_pieces(self.size[0], self.size[1], standing)
 
     @property
     def obstacles(self) -> list[Rect]:
-        """Footprints that one cannot walk through."""
+        """Footprints that block the way."""
         standing = [solid.rect for solid in self.solids if solid.bottom < _HEADROOM]
         return standing + [item.rect for item in self.furniture if item.blocks]
 
     @property
     def models(self) -> list[str]:
-        """Names of the catalogue's models in it, sorted, each once."""
+        """Names of its models of the catalogue, sorted, each once."""
         return sorted({item.model for item in self.furniture} | {item.model for item in self.windows})
 
     @property
@@ -222,10 +222,10 @@ class Plan:
         return not any(None in pair for pair in pairs)
 
     def completed(self, catalogue: Catalogue) -> Plan:
-        """A copy whose furniture and windows have all sizes and elevations.
+        """Copy the plan, with the sizes and elevations of all furniture and windows.
 
         Raises:
-            SceneError: the catalogue lacks a model; the message names all that it lacks.
+            SceneError: the catalogue lacks a model; the message names all missing ones.
         """
         missing = [model for model in self.models if model not in catalogue]
         if missing:

@@ -1,4 +1,4 @@
-"""Plans as YAML: one line for each thing in the room, and every fault of a file named at once."""
+"""Plans as YAML: one line per object in the room; an error lists all faults of a file."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ _Dumper.add_representer(
 
 
 def _plain(value: Any) -> Any:
-    """Dataclasses as mappings without the entries that have their default."""
+    """Dataclasses as mappings without entries at their defaults."""
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         entries = {}
         for field in dataclasses.fields(value):
@@ -52,7 +52,7 @@ def _plain(value: Any) -> Any:
 
 
 def to_yaml(plan: Plan) -> str:
-    """The plan as YAML; :func:`from_yaml` gives an equal plan back.
+    """Write a plan as YAML, from which :func:`from_yaml` makes an equal plan.
 
     >>> print(to_yaml(Plan("cell", size=(3.0, 2.0, 2.6))))
     name: cell
@@ -136,10 +136,10 @@ def from_yaml(text: str, source: str = "plan") -> Plan:
 
     Args:
         text: the YAML.
-        source: what errors call it, such as its file's name.
+        source: name in errors, such as the file's.
 
     Raises:
-        SceneError: it is no YAML, or has faults; the message lists every one of them.
+        SceneError: the text is no YAML, or has faults; the message lists all of them.
 
     >>> from_yaml("name: cell\\nsize: [3, 2]\\ngird: {step: 1}", "cell.yaml")
     Traceback (most recent call last):
@@ -163,7 +163,7 @@ def load_plan(path: str | os.PathLike[str]) -> Plan:
     """Read and check a plan's file.
 
     Raises:
-        SceneError: there is no such file, or see :func:`from_yaml`.
+        SceneError: there is no such file; or as for :func:`from_yaml`.
     """
     return from_yaml(read_text(path, SceneError, "give the file of a plan in YAML"), str(path))
 

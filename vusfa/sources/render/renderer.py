@@ -1,4 +1,4 @@
-"""The camera: one frame for each pose, denoised, and how its brightness becomes a picture."""
+"""The camera: one denoised frame per pose, and its tone mapping to a picture."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from vusfa.sources.render.plan import Camera
 
 __all__ = ["Renderer", "exposure_of", "look_at", "tone_map"]
 
-#: What the median brightness of a room's frames is brought to.
+#: Median brightness of a room's frames after exposure.
 _MEDIAN = 0.21
 
 
 def look_at(x: float, z: float, heading: float, camera: Camera) -> tuple[list[float], list[float]]:
-    """Where the camera is and a point that it looks at, in the renderer's frame (x to the left, y up).
+    """Position of the camera and a point in view, in the renderer's frame (x to the left, y up).
 
     >>> look_at(2.0, 1.0, 90.0, Camera(pitch=0.0))
     ([-2.0, 1.4, 1.0], [-3.0, 1.4, 1.0])
@@ -32,7 +32,7 @@ def exposure_of(frames: np.ndarray) -> float:
     """The factor that brings the median brightness of linear frames (n, H, W, 3) to 0.21.
 
     Raises:
-        SceneError: they are black.
+        SceneError: the frames are black.
 
     >>> exposure_of(np.full((2, 4, 4, 3), 0.42))
     0.5
@@ -73,7 +73,7 @@ class Renderer:
                 "fov_axis": "x",
                 "near_clip": 0.02,
                 "to_world": self._pose(0.0, 0.0, 0.0),
-                # Any wider filter correlates the noise of neighbours, and the denoiser takes it for detail.
+                # A wider filter correlates the noise of pixels, which the denoiser keeps as detail.
                 "film": {
                     "type": "hdrfilm",
                     "width": camera.resolution[0],
@@ -90,12 +90,12 @@ class Renderer:
         return self._mi.ScalarTransform4f().look_at(origin=origin, target=target, up=[0, 1, 0])
 
     def frame(self, x: float, z: float, heading: float, seed: int) -> np.ndarray:
-        """What is seen from a pose, (H, W, 3) linear float32; the same seed gives the same noise."""
+        """View from a pose, (H, W, 3) linear float32; the same seed gives the same noise."""
         import mitsuba_oidn
 
         self._values["to_world"] = self._pose(x, z, heading)
         self._values.update()
-        # mi.render would do the same, but turns Ctrl-C into a RuntimeError.
+        # mi.render would turn Ctrl-C into a RuntimeError.
         samples = self._camera.samples
         layers = np.array(
             self._integrator.render(self._scene, self._sensor, seed=seed, spp=samples, evaluate=False)

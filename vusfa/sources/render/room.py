@@ -1,7 +1,7 @@
 """Rendering of a plan into a scene file: frames, features, graph, credits for the furniture.
 
-The work can be stopped at any moment and started again: finished frames and features lie beside the
-product, in hidden files that are removed when it is written.
+Rendering can be stopped and resumed at any time: finished frames and features are kept beside the scene
+file, in hidden files that are removed when it is written.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from vusfa.sources.summary import look_alike_share
 
 __all__ = ["Rendered", "credits", "render_room"]
 
-#: ``progress(what, done, total)``: "frames" or "features"; first with what was done before.
+#: ``progress(what, done, total)``: "frames" or "features"; the first call counts those of an earlier run.
 Progress = Callable[[str, int, int], None]
 
 
@@ -44,9 +44,9 @@ class Rendered:
     Args:
         path: the scene file.
         states: N.
-        backend: what rendered it.
-        seconds_per_frame: of the frames rendered now; None when all were there from before.
-        look_alikes: share of states that some other state looks like (:mod:`vusfa.sources.summary`).
+        backend: Mitsuba's variant.
+        seconds_per_frame: mean over the frames rendered in this run; None without any.
+        look_alikes: share of states that look like another state (:mod:`vusfa.sources.summary`).
     """
 
     path: Path
@@ -56,7 +56,7 @@ class Rendered:
     look_alikes: float
 
     def __str__(self) -> str:
-        rate = f", {self.seconds_per_frame:.2f} s a frame" if self.seconds_per_frame is not None else ""
+        rate = f", {self.seconds_per_frame:.2f} s per frame" if self.seconds_per_frame is not None else ""
         return (
             f"{self.path}: {self.states} states, {self.backend}{rate}; {100 * self.look_alikes:.1f} % of them"
             f" look like another state"
@@ -64,7 +64,7 @@ class Rendered:
 
 
 def credits(plan: Plan, catalogue: Catalogue) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Licences of the collections that a plan's models are from, and one line of credit for each model."""
+    """Licences of the collections of a plan's models, and one line of credit per model."""
     models = [catalogue[name] for name in plan.models]
     collections = sorted({model.collection for model in models})
     licences = tuple(f"{name}: {LICENCES.get(name, 'licence unknown')}" for name in collections)
@@ -112,23 +112,23 @@ def render_room(
     threads: int | None = None,
     say: Callable[[str], None] | None = None,
 ) -> Rendered:
-    """Render every pose of a plan and write the scene, atomically; called again it goes on where it was.
+    """Render every pose of a plan and write the scene, atomically; resumes a run that was stopped.
 
     The same plan gives the same graph and poses, and with the same variant and versions the same pictures.
 
     Args:
         plan: the room.
         out: scene file to write.
-        progress: called with frames, then with features.
-        catalogue: furniture with its files; that of this machine when left out.
-        backbone: makes the features: a name for :func:`vusfa.sources.backbones.load_backbone`, or a network.
-        backend: Mitsuba's variant; the fastest that works when left out.
-        threads: how many threads render, on which pictures do not depend; when left out one for each core,
-            and one without LLVM.
-        say: called with a line that names the variant.
+        progress: called for frames, then for features.
+        catalogue: furniture with its files; that of this machine by default.
+        backbone: network of the features, or its name for :func:`vusfa.sources.backbones.load_backbone`.
+        backend: Mitsuba's variant; the fastest one that works by default.
+        threads: number of threads, which does not change the pictures; by default one per core, or one
+            without LLVM.
+        say: called with a line of text that names the variant.
 
     Raises:
-        SceneError: the plan has faults, furniture or packages are missing, or the file cannot be written.
+        SceneError: the plan has faults, furniture or a package is missing, or the file cannot be written.
         ConfigError: the backbone or its weights are missing, or ``threads`` is below 1.
     """
     out = Path(out)

@@ -1,4 +1,4 @@
-"""The textures of one plan's floor, ceiling and walls, each drawn in turn from the plan's one seed."""
+"""Textures of a plan's floor, ceiling and walls, drawn in this order from the plan's seed."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from vusfa.sources.render.plan import Plan
 
 __all__ = ["Textures", "draw_textures"]
 
-# Hues a golden section apart never come near one another again.
+# Multiples of the golden section stay far apart modulo 1.
 _HUE_STEP = 0.618
 
 
@@ -21,10 +21,10 @@ class Textures:
     """sRGB arrays (height, width, 3), the top row first.
 
     Args:
-        floors: rectangle and texture of each, the later ones over the earlier ones.
-        ceiling: of the whole room.
-        walls: one for each of ``plan.walls``.
-        lintels: one for each of the plan's lintels, for all of its sides.
+        floors: a rectangle and a texture each; later ones cover earlier ones.
+        ceiling: one texture for the whole room.
+        walls: one texture per wall of ``plan.walls``.
+        lintels: one texture per lintel of the plan, for all of its sides.
     """
 
     floors: list[tuple[Rect, np.ndarray]]
@@ -36,8 +36,8 @@ class Textures:
 def draw_textures(plan: Plan) -> Textures:
     """Draw all surfaces of a room.
 
-    Walls take the patterns that the plan names; where it names none the seed puts all patterns in an order,
-    so that no two of nine walls share one. Every wall has a hue of its own.
+    Walls have the patterns that the plan names; by default all nine patterns in an order drawn from the seed.
+    Every wall has its own hue.
 
     >>> [wall.shape for wall in draw_textures(Plan("cell", (2.0, 1.5, 2.6))).walls]
     [(338, 260, 3), (338, 260, 3), (338, 195, 3), (338, 195, 3)]

@@ -1,8 +1,7 @@
-"""Patterns of walls, floors and ceilings, drawn by numpy.
+"""Patterns of walls, floors and ceilings, drawn with NumPy.
 
-All are float arrays (height, width, 3) of sRGB values in 0..1, the top row first; all chance comes from the
-``RandomState`` that is passed in. The blotches on walls and floors keep two places of one wall from looking
-alike.
+All are float arrays (height, width, 3) of sRGB values in 0..1, the top row first; all randomness is that of
+the ``RandomState`` argument. Blotches on walls and floors make all places of a wall look different.
 """
 
 from __future__ import annotations
@@ -20,7 +19,7 @@ FLOORS = ("wood", "tile", "check")
 #: Patterns of walls.
 WALLS = ("stripe", "wainscot", "brick", "plain", "dots", "tile", "chevron", "plank", "diamond")
 
-_WALL_PIXELS, _FLOOR_PIXELS, _CEILING_PIXELS = 130, 100, 30  # a metre
+_WALL_PIXELS, _FLOOR_PIXELS, _CEILING_PIXELS = 130, 100, 30  # per metre
 _WAINSCOT = 1.05
 _SKIRTING = 0.1
 _BRICK = (0.22, 0.075)
@@ -28,7 +27,7 @@ _PLANK = 0.14
 
 
 def random_stream(seed: int) -> np.random.RandomState:
-    """A source of chance whose numbers numpy promises never to change; seeds of any size.
+    """Random number generator whose numbers never change between versions of NumPy; seeds of any size.
 
     >>> int(random_stream(1).randint(100))
     37
@@ -60,7 +59,7 @@ def _brick_shift(y: np.ndarray) -> np.ndarray:
     return 0.5 * (np.floor(y / _BRICK[1]) % 2)
 
 
-# Where a wall has its second color: x from the left, y from the top, period p, the wall's height h.
+# Masks of a wall's second color: x from the left, y from the top, period p, the wall's height h.
 _MASKS: dict[str, Callable[[np.ndarray, np.ndarray, float, float], np.ndarray]] = {
     "stripe": lambda x, y, p, h: (x / p) % 1 < 0.45,
     "dots": lambda x, y, p, h: (
@@ -79,7 +78,7 @@ _MASKS: dict[str, Callable[[np.ndarray, np.ndarray, float, float], np.ndarray]] 
 def _tone_of_pieces(
     pattern: str, x: np.ndarray, y: np.ndarray, period: float, rng: np.random.RandomState
 ) -> np.ndarray:
-    """Every tile, brick or plank is a little lighter or darker than the next."""
+    """Make each tile, brick or plank a little lighter or darker than the others."""
     wide, high = {"tile": (period, period), "brick": _BRICK, "plank": (_PLANK, 9.0)}[pattern]
     shift = _brick_shift(y) if pattern == "brick" else 0
     column, row = np.floor(x / wide + shift).astype(int), np.floor(y / high).astype(int)
@@ -93,10 +92,10 @@ def wall(pattern: str, hue: float, length: float, height: float, rng: np.random.
 
     Args:
         pattern: one of :data:`WALLS`.
-        hue: of its first color.
+        hue: hue of its first color.
         length: metres.
         height: metres.
-        rng: draws the shades, the second color, the pattern's period and the blotches.
+        rng: source of the shades, the second color, the pattern's period and the blotches.
 
     Returns:
         (130 * height, 130 * length, 3) float32.
@@ -145,13 +144,13 @@ def _slabs(pattern: str, x: np.ndarray, y: np.ndarray, rng: np.random.RandomStat
 
 
 def floor(pattern: str, width: float, depth: float, rng: np.random.RandomState) -> np.ndarray:
-    """A floor.
+    """A floor of a pattern.
 
     Args:
         pattern: one of :data:`FLOORS`.
         width: metres, along the array's second axis.
         depth: metres.
-        rng: draws colors, boards or slabs, and blotches.
+        rng: source of the colors, the boards or slabs, and the blotches.
 
     Returns:
         (100 * depth, 100 * width, 3) float32.
