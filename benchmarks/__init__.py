@@ -1,1 +1,1 @@
-"""Speed, side by side with what a user would pick instead: python benchmarks/run.py --help"""
+"""Speed of the library beside its alternatives: python benchmarks/run.py --help"""

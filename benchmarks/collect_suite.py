@@ -1,6 +1,6 @@
-"""Collection with the VUSFA agent (4 frames, 4 rooms) beside a bare loop, and fed with features.
+"""Collection with the VUSFA agent (4 frames, 4 rooms) beside a bare loop and a feature-fed collector.
 
-With the recipe's 256 environments, with fewer and with more: a step of few rows is mostly calls.
+With the recipe's 256 environments, with fewer and with more: calls dominate a step of few rows.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ SIZES = (64, 256, 1024)
 
 
 def run(options: Options) -> Report:
-    """Frames a second of the recipe's collector, weights standing still."""
+    """Frames per second of the recipe's collector with constant weights."""
     report = Report("collect")
     for size in (8,) if options.quick else SIZES:
         _at(size, options, report)

@@ -1,4 +1,4 @@
-"""The environment alone, with a random policy: how much of a bare loop's speed TorchRL's conventions cost."""
+"""The environment alone, with a random policy: the cost of TorchRL's conventions over a bare loop."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ BOUND = 1.5e6
 
 
 def run(options: Options) -> Report:
-    """Frames per processor second at five batch sizes, each beside a bare loop, and Gymnasium's ways."""
+    """Frames per processor second at five batch sizes, each beside a bare loop and Gymnasium's workers."""
     scenes = SceneSet.bundled(["bathroom"] if options.quick else None)
     sizes = (1, 16) if options.quick else SIZES
     goals = resolve_goals(scenes, "paper")

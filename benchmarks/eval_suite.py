@@ -1,4 +1,4 @@
-"""Zero-shot evaluation of every state as a goal, ten episodes each, beside one at a time."""
+"""Zero-shot evaluation of every state as a goal, ten episodes each, beside one episode at a time."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ MINUTES = 2.0
 def run(options: Options) -> Report:
     """Untrained VUSFA agents, which wander for most of the 500 steps, as recipes/zero_shot.py evaluates them.
 
-    One as the recipe builds it, and one of four frames with layers of 512, as preset=controlled has it.
+    One is the recipe's; one has four frames and layers of 512, as in preset=controlled.
     """
     scenes = SceneSet.bundled(["bathroom"] if options.quick else None)
     torch.set_num_threads(options.threads)

@@ -1,4 +1,4 @@
-"""The machine that the numbers are of."""
+"""Description of the machine that is measured."""
 
 from __future__ import annotations
 
@@ -43,8 +43,7 @@ def describe_machine() -> dict[str, Any]:
 
 
 def foreign_load(seconds: float = 1.0) -> float:
-    """Processors that other programs keep busy, in cores: with more than a little of it no timing is worth
-    anything."""
+    """Load of other programs, in cores; with more than a little of it timings are worthless."""
     own = psutil.Process()
     before = own.cpu_times()
     busy = psutil.cpu_percent(interval=seconds) / 100 * (psutil.cpu_count() or 1)

@@ -1,4 +1,4 @@
-"""Memory: bytes a frame, the most that a training holds, and whether it grows."""
+"""Memory: bytes per frame, peak of a training, and growth."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ SLACK = 8.0
 
 
 def run(options: Options) -> Report:
-    """Each measurement in a process of its own."""
+    """Run each measurement in its own process."""
     report = Report("memory")
     tiny = small(options)
     kinds = {
@@ -49,14 +49,14 @@ def run(options: Options) -> Report:
 
 
 def bytes_a_frame(overrides: Sequence[str]) -> float:
-    """Bytes of a collected batch, a frame."""
+    """Bytes per frame of a collected batch."""
     with running(overrides) as ours:
         batch = next(ours.batches)
     return batch.bytes() / batch.numel()
 
 
 def peak(overrides: Sequence[str], updates: int) -> float:
-    """The most memory that this process has held after so many updates, MiB."""
+    """Peak memory of this process after some updates, in MiB."""
     with running(overrides) as ours:
         for _ in range(updates):
             ours.update()
@@ -64,16 +64,16 @@ def peak(overrides: Sequence[str], updates: int) -> float:
 
 
 def peak_so_far() -> float:
-    """The most memory that this process has held, MiB."""
+    """Peak memory of this process so far, in MiB."""
     status = Path("/proc/self/status")
-    if status.exists():  # of this program alone; what getrusage tells may be the parent's
+    if status.exists():  # of this process alone; getrusage may report the parent's
         line = next(line for line in status.read_text().splitlines() if line.startswith("VmHWM"))
         return int(line.split()[1]) / 1024
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
 
 
 def growth(overrides: Sequence[str], updates: int) -> float:
-    """Resident memory after so many updates less that after a tenth of them, MiB."""
+    """Resident memory after some updates minus that after a tenth of them, in MiB."""
     torch.set_num_threads(1)
     own, before = psutil.Process(), 0
     with running(overrides) as ours:
@@ -88,7 +88,7 @@ def growth(overrides: Sequence[str], updates: int) -> float:
 
 
 def _apart(function: object, *arguments: object) -> float:
-    """The function's result, computed in a process of its own."""
+    """Compute the function's result in its own process."""
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload(["benchmarks.trainer"])  # imported once, for all
     with ProcessPoolExecutor(1, mp_context=context) as pool:

@@ -1,6 +1,6 @@
 """Updates with ``autocast=auto`` beside ``true`` and ``false``, on this processor and without bfloat16 units.
 
-The latter is an imitation: in a process of its own torch and oneDNN may use AVX2 alone. It multiplies as a
+The latter is an imitation: in a separate process torch and oneDNN may use AVX2 alone. It multiplies as a
 processor without such units does; clock and memory are still this machine's.
 """
 
@@ -20,7 +20,7 @@ from benchmarks.trainer import running, small
 
 __all__ = ["AVX2", "run"]
 
-#: What limits torch and oneDNN to AVX2.
+#: Environment that limits torch and oneDNN to AVX2.
 AVX2 = {"ONEDNN_MAX_CPU_ISA": "AVX2", "ATEN_CPU_CAPABILITY": "avx2"}
 SETTINGS = ("auto", "true", "false")
 
@@ -45,7 +45,7 @@ def run(options: Options) -> Report:
 
 
 def _elsewhere(options: Options, environment: dict[str, str]) -> dict[str, Timing]:
-    """Timings of another process, whose libraries see the environment before they begin."""
+    """Timings of another process, whose libraries read the environment when they start."""
     given = [str(int(options.quick)), str(options.repetitions), str(options.seconds), str(options.threads)]
     done = subprocess.run(
         [sys.executable, "-m", "benchmarks.precision_suite", *given, *options.overrides],

@@ -1,4 +1,4 @@
-"""What a suite found out: rows, requirements, and the file that holds them."""
+"""Results of a suite: rows, requirements, and their file."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ __all__ = ["Options", "Report", "Requirement", "Row", "read_reports", "write_rep
 
 @dataclass(frozen=True)
 class Options:
-    """How thoroughly to measure.
+    """Options of a measurement.
 
     Attributes:
         quick: tiny sizes, to see that everything runs; the numbers mean nothing.
         repetitions: turns of each workload.
-        seconds: of a turn.
-        threads: of torch, where two cores are spoken of.
+        seconds: length of a turn.
+        threads: threads of torch, in measurements on two cores.
         cap: seconds after which a training counts as not solving the task.
         overrides: settings of the recipe that are not its default ones.
     """
@@ -42,10 +42,10 @@ class Row:
 
     Attributes:
         name: what was measured.
-        value, unit: how much of what.
-        peer: what it is compared with.
+        value, unit: the result and its unit.
+        peer: the alternative that it is compared with.
         ratio: ours over the peer's, more is better for us; None without a peer.
-        note: what must be known to read it.
+        note: remark for the reader.
         samples: the turns that ``value`` is the median of.
     """
 
@@ -60,7 +60,7 @@ class Row:
 
 @dataclass(frozen=True)
 class Requirement:
-    """A bound that the library promises to keep.
+    """A bound that the library must keep.
 
     >>> Requirement("fast", value=3.0, bound=2.0, unit="times").line()
     'PASS  fast: 3 times (at least 2)'
@@ -100,7 +100,7 @@ class Report:
 
 
 def number(value: float) -> str:
-    """A number as people read it.
+    """Format a number for people.
 
     >>> number(1234567.0), number(12.345), number(0.01234), number(float("nan"))
     ('1,234,567', '12.3', '0.0123', 'not reached')

@@ -1,4 +1,4 @@
-"""Measures the library beside what a user would pick instead: python benchmarks/run.py --suite train
+"""Measure the library beside its alternatives: python benchmarks/run.py --suite train
 
 Needs the extra ``bench``. Writes OUT/SUITE.json and prints tables; each requirement is a line, PASS or FAIL.
 The exit code is 1 when a requirement fails, except with --quick, whose numbers mean nothing.
@@ -25,7 +25,7 @@ from vusfa.training.memory import keep_memory
 
 
 class Suite(StrEnum):
-    """What can be measured."""
+    """Suites that can be measured."""
 
     env = "env"
     train = "train"
@@ -54,7 +54,7 @@ MODULES: dict[str, tuple[str, ...]] = {
 }
 #: Several modules under one name.
 GROUPS = {"train": ("collect", "update", "solve", "memory"), "all": tuple(MODULES)}
-#: More other load than this, in cores, and the timings are doubtful.
+#: Load of other programs, in cores, above which timings are doubtful.
 BUSY = 0.2
 
 
@@ -68,9 +68,9 @@ def main(
     suite: Annotated[Suite, typer.Option(help="what to measure")] = Suite.all,
     quick: Annotated[bool, typer.Option(help="tiny sizes, to see that everything runs")] = False,
     out: Annotated[Path, typer.Option(help="folder of the JSON file")] = Path("runs/benchmarks"),
-    threads: Annotated[int, typer.Option(min=1, help="of torch, on two cores")] = 2,
+    threads: Annotated[int, typer.Option(min=1, help="threads of torch, on two cores")] = 2,
     repetitions: Annotated[int, typer.Option(min=1, help="turns of each workload")] = 5,
-    seconds: Annotated[float, typer.Option(min=0.0, help="of a turn")] = 1.0,
+    seconds: Annotated[float, typer.Option(min=0.0, help="length of a turn")] = 1.0,
     cap: Annotated[float, typer.Option(min=0.0, help="seconds that a training may take to solve")] = 900.0,
     change: Annotated[
         list[str] | None, typer.Option("--set", help="a recipe's setting: autocast=true")
@@ -80,7 +80,7 @@ def main(
     options = Options(quick, repetitions, seconds, threads, cap, tuple(change or ()))
     if quick:
         options = replace(options, repetitions=1, seconds=0.0)
-    keep_memory()  # as recipes do; the peers have it, too
+    keep_memory()  # as in the recipes, and for the peers, too
     console, machine = Console(), describe_machine()
     machine["foreign_load"] = round(foreign_load(), 2)
     print_machine(machine, console)

@@ -22,7 +22,7 @@ ACTIVE, KEPT = 4, 0.75
 
 
 def run(options: Options) -> Report:
-    """Complete VUSFA updates, one process for each point of the grid."""
+    """Complete VUSFA updates, one process per point of the grid."""
     report = Report("scaling")
     rooms_, envs_ = ((2,), (8,)) if options.quick else (ROOMS, ENVS)
     points = [(rooms, envs, 1, 0) for rooms in rooms_ for envs in envs_]
@@ -53,7 +53,7 @@ def run(options: Options) -> Report:
 
 
 def measure(rooms: int, overrides: Sequence[str], seconds: float, threads: int) -> tuple[int, float, float]:
-    """States of the world, frames a second of complete updates, and the main process's peak memory in MiB."""
+    """Number of states, frames per second of complete updates, peak memory of the main process in MiB."""
     torch.set_num_threads(threads)
     scenes = tiled(rooms)
     with running(overrides, scenes) as ours:

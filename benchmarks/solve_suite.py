@@ -42,13 +42,13 @@ MINUTES = 15
 
 
 class Outcome(NamedTuple):
-    """How a training went.
+    """Outcome of a training.
 
     Attributes:
         seconds: of training until solved; NaN when it was not.
         spent: seconds of training in all.
-        frames: trained on.
-        success, detour: at the last check.
+        frames: frames of training.
+        success, detour: values at the last check.
     """
 
     seconds: float
@@ -80,10 +80,10 @@ def train_until(
     Args:
         update: trains a little; returns frames.
         check: success and length over shortest path now; its time does not count.
-        cap: seconds of training at most.
+        cap: limit of seconds of training.
         every: seconds of training between checks.
         most_frames: where the training's schedule ends.
-        clock: seconds.
+        clock: returns seconds.
 
     >>> ticks = iter(range(100))
     >>> outcome = train_until(lambda: 8, lambda: (1.0, 1.0), cap=9, every=2, clock=lambda: next(ticks))

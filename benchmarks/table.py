@@ -14,7 +14,7 @@ __all__ = ["print_machine", "print_report"]
 
 
 def print_machine(machine: dict[str, Any], console: Console) -> None:
-    """One line on where the numbers come from."""
+    """Print one line that describes the machine."""
     flags = f" ({', '.join(machine['cpu_flags'])})" if machine["cpu_flags"] else ""
     gpu = f", {machine['gpu']}" if machine["gpu"] else ", no GPU"
     console.print(
@@ -26,7 +26,7 @@ def print_machine(machine: dict[str, Any], console: Console) -> None:
 
 
 def print_report(report: Report, console: Console, quick: bool = False) -> None:
-    """A suite's rows, then its requirements, one a line."""
+    """Print a suite's rows, then its requirements, one per line."""
     if report.skipped:
         console.print(Text(f"{report.suite}: skipped, {report.skipped}"))
         return

@@ -1,7 +1,7 @@
-"""Things timed in turn, so that what slows the machine down slows all of them down.
+"""Timing of workloads in turn, so that a slow machine slows all of them down.
 
 A workload is a function that does some work and returns how much (frames, episodes). Workloads take turns,
-A B A B ..., each turn a fixed time; what is reported is the median over turns, and a ratio is the median of
+A B A B ..., each turn a fixed time; the result is the median over turns, and a ratio is the median of
 the ratios within a round. Processor time counts this process and the worker processes below it.
 """
 
@@ -21,11 +21,11 @@ __all__ = ["Clock", "Sample", "Timing", "Work", "interleaved", "ratio"]
 
 @dataclass(frozen=True)
 class Work:
-    """Something to time.
+    """A workload to time.
 
     Args:
         call: does some work and returns how much.
-        threads: of torch, meanwhile.
+        threads: threads of torch during the call.
     """
 
     call: Callable[[], int]
@@ -34,7 +34,7 @@ class Work:
 
 @dataclass(frozen=True)
 class Sample:
-    """One turn: units of work, seconds on the wall, seconds of processors."""
+    """One turn: units of work, wall-clock seconds, processor seconds."""
 
     units: int
     wall: float
@@ -54,12 +54,12 @@ class Timing:
 
     @property
     def rates(self) -> list[float]:
-        """Units a second, turn by turn."""
+        """Units per second, for each turn."""
         return [sample.units / sample.wall for sample in self.samples]
 
     @property
     def cpu_rates(self) -> list[float]:
-        """Units a processor second, turn by turn."""
+        """Units per processor second, for each turn."""
         return [sample.units / sample.cpu for sample in self.samples]
 
     @property
@@ -74,7 +74,7 @@ class Timing:
 
 
 class Clock:
-    """The time on the wall and that of the processors: this process and the live processes below it."""
+    """Wall-clock time and processor time of this process and its live child processes."""
 
     def __init__(self) -> None:
         self._process = psutil.Process()
@@ -98,13 +98,13 @@ class Clock:
 def interleaved(
     works: Mapping[str, Work], repetitions: int, seconds: float, clock: Clock | None = None
 ) -> dict[str, Timing]:
-    """Time workloads in turn; each works once before, unmeasured.
+    """Time workloads in turn, after one unmeasured call of each.
 
     Args:
         works: by name.
-        repetitions: turns of each.
-        seconds: a turn ends with the first call after so many.
-        clock: what tells the time.
+        repetitions: turns per workload.
+        seconds: a turn ends with the first call after this time.
+        clock: source of the time.
 
     >>> timings = interleaved({"sleep": Work(lambda: 1)}, repetitions=2, seconds=0.0)
     >>> len(timings["sleep"].samples)

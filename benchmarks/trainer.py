@@ -35,7 +35,7 @@ def recipe_settings(overrides: Sequence[str] = ()) -> DictConfig:
 
 @dataclass
 class Running:
-    """A trainer that collects, as works to measure.
+    """A collecting trainer, as workloads to measure.
 
     Attributes:
         trainer: with the recipe's settings.
@@ -46,11 +46,11 @@ class Running:
     batches: Iterator[TensorDictBase]
 
     def collect(self) -> int:
-        """Collects one batch and drops it; its frames."""
+        """Collect one batch and drop it; return its frames."""
         return self.trainer.collect(self.batches).numel()
 
     def update(self) -> int:
-        """One update; its frames."""
+        """Make one update; return its frames."""
         return self.trainer.update(self.batches)[0].numel()
 
 
@@ -69,7 +69,7 @@ def running(overrides: Sequence[str] = (), scenes: SceneSet | None = None) -> It
 
 
 def small(options: Options) -> list[str]:
-    """What the options change of the recipe's settings: all tiny with ``--quick``, then what was given."""
+    """Overrides of the recipe's settings: tiny sizes with ``--quick``, then those of the options."""
     if not options.quick:
         return list(options.overrides)
     sizes = ["agent.hidden_size=16", "agent.embedding_size=16"]

@@ -16,9 +16,9 @@ from benchmarks.trainer import Running, running, small
 
 __all__ = ["RELEASED", "run"]
 
-#: Frames a second of the released code: folder 6, 20 threads, TensorFlow's compatibility mode, two cores.
+#: Frames per second of the released code: folder 6, 20 threads, TensorFlow's compatibility mode, two cores.
 RELEASED = 162.0
-#: How many times as fast as that, by the frames of the history.
+#: Required speed relative to that, by the frames of the history.
 BOUNDS = {1: 100.0, 4: 60.0}
 #: The same with the paper's preset: 10 million frames in an hour.
 PAPER = 17.0
@@ -41,7 +41,7 @@ def _paper_works(options: Options, stack: ExitStack) -> dict[str, Work]:
     """VUSFA as the paper has it: 100 environments of 5 steps, layers of 512, four frames, A3C's step."""
     changed = small(options)
     if options.quick:
-        changed = [*changed, "collector.num_envs=10"]  # every goal has one
+        changed = [*changed, "collector.num_envs=10"]  # one per goal
     ours = stack.enter_context(running(["preset=paper", "agent.model=vusfa", *changed]))
     bare = BareTraining(ours.trainer)
     works = {"ours": Work(ours.update, options.threads), "bare update": Work(bare.update, options.threads)}

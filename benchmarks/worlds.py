@@ -1,4 +1,4 @@
-"""The rooms that the suites walk in: the bundled four, or copies of them for a larger world."""
+"""Rooms of the suites: the bundled four, or copies of them for a larger world."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ __all__ = ["tiled"]
 
 
 def tiled(rooms: int) -> SceneSet:
-    """So many rooms: the bundled four over and over, each copy a scene of its own.
+    """Make a set of ``rooms`` scenes by repeating the bundled four; each copy is a separate scene.
 
     Copies share their tables' memory until the set joins them.
 

@@ -1,6 +1,6 @@
 """Run an agent that `vusfa export` wrote, without torch: python run_onnx.py agent.onnx goal.jpg FOLDER
 
-Needs numpy, pillow and onnxruntime. Prints an action for each picture of the folder, in the order of names.
+Needs numpy, pillow and onnxruntime. Prints one action per picture of the folder, in the order of names.
 """
 
 import json

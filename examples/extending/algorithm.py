@@ -2,7 +2,7 @@
 
     python examples/extending/algorithm.py algorithm=ppo algorithm.epochs=3 scenes=[bathroom]
 
-Each batch is learned from several times; what the paper's models learn besides the policy stays as it is.
+Each batch is used for several passes; the other losses of the paper's models are unchanged.
 """
 
 from __future__ import annotations
@@ -65,7 +65,7 @@ class PPO(USF):
 
 
 def main(settings: dict[str, Any], overrides: list[str]) -> int:
-    """Trains and evaluates like ``vusfa train``."""
+    """Train and evaluate like ``vusfa train``."""
     return train(settings, overrides).exit_code
 
 

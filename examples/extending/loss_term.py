@@ -1,4 +1,4 @@
-"""An additional term of the loss in one file: successor features are kept small.
+"""An additional term of the loss in one file: a penalty on the size of successor features.
 
 python examples/extending/loss_term.py objective.terms.successor_size=0.01 scenes=[bathroom]
 """
@@ -21,7 +21,7 @@ class SuccessorSize(LossModule):
 
     Args:
         agent: whose critic writes ``successor_features``.
-        coefficient: of the term.
+        coefficient: weight of the term.
 
     Raises:
         ValueError: the agent has no successor features.
@@ -53,7 +53,7 @@ register_loss_term("successor_size", SuccessorSize)
 
 
 def main(settings: dict[str, Any], overrides: list[str]) -> int:
-    """Trains and evaluates like ``vusfa train``."""
+    """Train and evaluate like ``vusfa train``."""
     return train(settings, overrides).exit_code
 
 

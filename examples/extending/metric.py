@@ -1,6 +1,6 @@
 """A new metric, from one function: python examples/extending/metric.py evaluate runs/.../checkpoint.pt
 
-The share of episodes that are as short as can be. It appears in the table of vusfa evaluate and its CSV, in
+The share of episodes on a shortest path. It appears in the table of vusfa evaluate and its CSV, in
 vusfa tables, and on the page of vusfa report wherever this module is imported first.
 """
 
@@ -17,7 +17,7 @@ from vusfa.report.print_tables import print_tables
 
 @register_metric("perfect", label="perfect", title="Episodes on a shortest path", unit="%", exact=True)
 def perfect(episodes: Episodes) -> tuple[Tensor, Tensor]:
-    """Numerator and denominator per episode: the goal was met in as few actions as possible; one."""
+    """Numerator and denominator per episode: whether the goal was reached on a shortest path; 1."""
     on_shortest_path = episodes.success & (episodes.length == episodes.shortest)
     return on_shortest_path, on_shortest_path | True
 

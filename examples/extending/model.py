@@ -28,7 +28,7 @@ class GatedPolicyHead(nn.Module):
 
 
 class GatedAgent(Agent):
-    """USFA with that policy; what it reads is said by the model's ideas: hidden state, psi, scene."""
+    """USFA with that policy; the model's ideas determine its inputs: hidden state, psi, scene."""
 
     def make_policy(self, config: AgentConfig, num_actions: int) -> nn.Module:
         """The gated head."""
@@ -39,7 +39,7 @@ register_model("gated", Model(True, True, False, GatedAgent))
 
 
 def main(settings: dict[str, Any], overrides: list[str]) -> int:
-    """Trains and evaluates like ``vusfa train``."""
+    """Train and evaluate like ``vusfa train``."""
     return train(settings, overrides).exit_code
 
 

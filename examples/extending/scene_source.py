@@ -3,7 +3,7 @@
     python examples/extending/scene_source.py grid-world maze.h5 --columns 6 --rows 4
     vusfa scenes check maze.h5
 
-A source finds out what the states are, where the actions lead and what each state looks like;
+A source gives the states, the successors of the actions and a picture per state;
 :func:`vusfa.sources.capture.capture` does the rest: features, provenance, checks, the file.
 """
 
@@ -26,7 +26,7 @@ HEADINGS = [(0, 1), (1, 0), (0, -1), (-1, 0)]  # +Z, +X, -Z, -X: one step ahead,
 
 
 def build(columns: int, rows: int) -> PoseGraph:
-    """Every cell in four headings; a wall around the room and a pillar in every second cell of it."""
+    """All cells in four headings, with a wall around the room and a pillar in every second cell."""
     cells = [(x, z) for x in range(columns) for z in range(rows) if not (x % 2 and z % 2)]
     state = {(x, z, h): 4 * i + h for i, (x, z) in enumerate(cells) for h in range(4)}
     graph = np.full((len(state), 4), -1)
@@ -41,7 +41,7 @@ def build(columns: int, rows: int) -> PoseGraph:
 
 
 def draw(states: PoseGraph, size: int = 64) -> np.ndarray:
-    """A corridor that is as deep as the way ahead is free, in colors that say where; (N, H, W, 3) uint8."""
+    """Draw a corridor as deep as the free way ahead, colored by place; (N, H, W, 3) uint8."""
     extent = np.maximum(states.location.max(0), 1)
     pictures = []
     for index, (place, heading) in enumerate(zip(states.location, states.rotation, strict=True)):
@@ -62,7 +62,7 @@ def grid_world(
     columns: Annotated[int, typer.Option(min=1, help="Cells along X.")] = 5,
     rows: Annotated[int, typer.Option(min=1, help="Cells along Z.")] = 5,
 ) -> None:
-    """Make a scene of a grid world, drawn."""
+    """Make a scene of a drawn grid world."""
     states = build(columns, rows)
     origin = Provenance(made_with=this_tool("scenes grid-world"), made_on=today())
     scene = capture(target, target.stem, states, draw(states), origin, attributes={"cell_m": 1.0})
@@ -74,7 +74,9 @@ def register(scenes: typer.Typer) -> None:
     scenes.command("grid-world")(grid_world)
 
 
-COMMANDS.append(__name__)  # the registry line; for good, write the module's name into vusfa/cli/__init__.py
+COMMANDS.append(
+    __name__
+)  # the registry line; permanently: write the module's name into vusfa/cli/__init__.py
 
 if __name__ == "__main__":
     main(["scenes", *sys.argv[1:]])

@@ -2,8 +2,8 @@
 
     python examples/sources/habitat.py apartment_1.glb apartment.h5
 
-Needs habitat-sim (https://github.com/facebookresearch/habitat-sim) and a scene of its own. What is asked of
-the simulator are its path finder (``get_bounds``, ``snap_point``, ``try_step``), ``agents[0].set_state`` and
+Needs habitat-sim (https://github.com/facebookresearch/habitat-sim) and a scene of its own. This file uses of
+the simulator its path finder (``get_bounds``, ``snap_point``, ``try_step``), ``agents[0].set_state`` and
 ``get_sensor_observations``; the test of this file runs it with a stand-in that answers these.
 """
 
@@ -26,7 +26,7 @@ AHEAD = {0.0: (0, -1), 90.0: (1, 0), 180.0: (0, 1), 270.0: (-1, 0)}  # x and z o
 
 
 def free_places(finder: Any, height: float, step: float) -> np.ndarray:
-    """Points (P, 3) of a grid that the agent can stand at, on the floor of that height."""
+    """Points (P, 3) of a grid where the agent can stand, on the floor at a height."""
     low, high = np.asarray(finder.get_bounds())
     grid = np.stack(np.meshgrid(np.arange(low[0], high[0], step), np.arange(low[2], high[2], step)), -1)
     places = []
@@ -39,7 +39,7 @@ def free_places(finder: Any, height: float, step: float) -> np.ndarray:
 
 
 def walked(finder: Any, places: np.ndarray, step: float) -> PoseGraph:
-    """Every place in four headings; a move leads where the mesh lets the agent slide, if a place is there."""
+    """All places in four headings; a move leads where the mesh lets the agent slide, if a place is there."""
     poses = [(place, heading) for place in places for heading in HEADINGS]
     location = np.array([[place[0], -place[2]] for place, _ in poses])  # ours has +z ahead
     rotation = np.array([heading for _, heading in poses])

@@ -1,4 +1,4 @@
-"""Scenes from ProcTHOR: houses drawn by a program, walked through in AI2-THOR.
+"""Scenes from ProcTHOR: procedurally generated houses in AI2-THOR.
 
     pip install 'vusfa[thor]' prior
     python examples/sources/procthor.py houses/ 0 7 12

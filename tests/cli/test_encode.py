@@ -83,7 +83,7 @@ def test_bfloat16_that_is_not_as_good_is_said(
     target = scene_file.with_name("new.h5")
     result = run("encode", scene_file, target, "--backbone", network, "--bfloat16")
     assert result.exit_code == 0
-    assert "bfloat16 was not as good" in result.stderr
+    assert "bfloat16 lost accuracy" in result.stderr
     assert Scene.load(target).attributes["feature_precision"] == "float32"
 
 

@@ -85,7 +85,7 @@ def test_raw_pictures_of_a_giant(make_file: Make) -> None:
     path = make_file()
     with h5py.File(path, "a") as file:
         file.create_dataset("observation", (5, 5000, 2, 3), "u1", chunks=True, compression=9)
-    assert "at most 4096 pixels a side" in fault(path)
+    assert "at most 4096 pixels per side" in fault(path)
 
 
 def png(width: int, height: int) -> bytes:

@@ -71,8 +71,8 @@ def run(
     """Print the action for each picture of a camera, until the goal is reached or the pictures end.
 
     Each line has the picture's number, the action, its probability, and the similarity of the picture with
-    the goal's. Cameras and films need OpenCV (`pip install opencv-python-headless`); folders and http addresses
-    need nothing.
+    the goal's. Cameras and films need OpenCV (`pip install opencv-python-headless`); folders and http
+    addresses do not.
 
     Examples:
 

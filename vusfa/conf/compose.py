@@ -21,9 +21,9 @@ def compose(folder: Path = FOLDER, name: str = "train", overrides: Sequence[str]
     """Compose the configuration as the command line would, without running anything.
 
     Args:
-        folder: of the configuration files.
-        name: of the primary one.
-        overrides: what would be on the command line.
+        folder: folder of the configuration files.
+        name: name of the primary file.
+        overrides: words of the command line.
     """
     if GlobalHydra.instance().is_initialized():  # within a job
         return hydra.compose(name, list(overrides))
@@ -33,7 +33,7 @@ def compose(folder: Path = FOLDER, name: str = "train", overrides: Sequence[str]
 
 @cache
 def default_settings() -> Mapping[str, Any]:
-    """Every setting by its dotted name, with the value that ``vusfa train`` has by default."""
+    """Every setting by its dotted name, with its default in ``vusfa train``."""
     settings = compose()
     OmegaConf.resolve(settings)
     return flat(OmegaConf.to_container(settings))  # type: ignore[arg-type]

@@ -1,4 +1,4 @@
-"""Checks of settings with OmegaConf and Hydra's ConfigStore; what is wrong is said in one line.
+"""Checks of settings with OmegaConf and Hydra's ConfigStore; one line per error.
 
 Needs Hydra (extra ``recipes``).
 """
@@ -27,7 +27,7 @@ _EXAMPLES = {"scenes": "[bathroom, kitchen]"}
 
 
 def schema() -> DictConfig:
-    """Types of all settings, with those of the registered algorithms' terms."""
+    """Types of all settings, including the terms of the registered algorithms."""
     types_ = OmegaConf.structured(Settings)
     types_.objective = OmegaConf.structured(ObjectiveSettings)
     types_.objective.terms = dict(LOSS_TERMS)
@@ -47,10 +47,10 @@ def check_overrides(overrides: Sequence[str]) -> None:
     ``0`` as well.
 
     Args:
-        overrides: of the command line, ``setting=value``.
+        overrides: words of the command line, ``setting=value``.
 
     Raises:
-        ConfigError: naming setting and value.
+        ConfigError: a value is neither; the message names setting and value.
 
     >>> check_overrides(["agent.shared_heads=true"])
     >>> check_overrides(["agent.shared_heads=off"])
@@ -72,10 +72,10 @@ def validated(settings: Mapping[str, Any], where: str = "") -> dict[str, Any]:
 
     Args:
         settings: plain or OmegaConf's, all of them.
-        where: begins the message; a file.
+        where: start of the message, such as a file.
 
     Raises:
-        ConfigError: a setting that is unknown, missing, of another type or out of range.
+        ConfigError: a setting is unknown, missing, of another type or out of range.
     """
     plain: Any = OmegaConf.to_container(settings) if isinstance(settings, DictConfig) else dict(settings)
     try:
@@ -105,7 +105,7 @@ def validated(settings: Mapping[str, Any], where: str = "") -> dict[str, Any]:
 
 
 def mistake(error: BaseException) -> str | None:
-    """Describe in one line an error of OmegaConf's, or of Hydra's while composing, about a setting."""
+    """Describe in one line an error of OmegaConf, or of Hydra while composing, about a setting."""
     while error is not None:
         key = getattr(error, "full_key", None)
         if isinstance(error, ConfigKeyError) or type(error).__name__ == "ConfigAttributeError":
@@ -121,7 +121,7 @@ def mistake(error: BaseException) -> str | None:
 
 
 def unknown_setting(name: str, names: Iterable[str] | None = None) -> str:
-    """The words for a setting that there is none of.
+    """Message for an unknown setting.
 
     >>> unknown_setting("sed")
     "no setting is called 'sed'; did you mean 'seed'?"
@@ -130,7 +130,7 @@ def unknown_setting(name: str, names: Iterable[str] | None = None) -> str:
 
 
 def _check_data(plain: Any, prefix: str = "") -> None:
-    """Nothing that OmegaConf would look up, and no name that a library would act on."""
+    """Refuse values that OmegaConf would interpolate, and names that a library would act on."""
     if isinstance(plain, dict):
         for key, value in plain.items():
             if not isinstance(key, str) or key.startswith("_"):
@@ -173,7 +173,7 @@ def _check_ranges(settings: Mapping[str, Any]) -> None:
 
 
 def _type_of(name: str) -> tuple[Any, bool]:
-    """Type of a setting by its dotted name, and whether it may be null; Any where nothing is known."""
+    """Type of a setting by its dotted name, and whether it may be null; Any if unknown."""
     kind, optional = Settings, False
     for part in name.split("."):
         hints = get_type_hints(kind) if is_dataclass(kind) else {}
@@ -208,7 +208,7 @@ def _example(name: str) -> str:
 
 
 def _shown(value: Any) -> str:
-    """As on a command line."""
+    """A value as written on a command line."""
     if isinstance(value, list):
         return f"[{', '.join(map(str, value))}]"
     return "null" if value is None else repr(value)

@@ -1,6 +1,6 @@
 """Settings of a training: one dataclass per group, with the type of every setting.
 
-Their values stand once: in the YAML files beside this module, or here where every choice has the same.
+Each default is given once: in the YAML files beside this module, or here if all choices share it.
 :mod:`vusfa.conf.schema` checks values against these types with OmegaConf. ``None`` stands for ``null``.
 """
 
@@ -35,7 +35,7 @@ ALGORITHMS: dict[str, Any] = {}
 LOSS_TERMS: dict[str, float] = {}
 #: Steps after which an episode is truncated, in training and evaluation, unless settings say otherwise.
 MAX_STEPS = 500
-#: Settings that a run divides by, and a time limit.
+#: Settings that a run uses as divisors, and a time limit.
 POSITIVE = (
     "log_every",
     "checkpoint_every",
@@ -50,7 +50,7 @@ POSITIVE = (
 @dataclass
 class EnvSettings:
     """Settings of :class:`vusfa.envs.TargetNavEnv`; goals and crop may be of several types. The last
-    three are of :class:`vusfa.envs.SceneRotation`; ``active_scenes`` null: all, all the time."""
+    three are those of :class:`vusfa.envs.SceneRotation`; ``active_scenes`` null: always all."""
 
     goals: Any
     goal_sampling: str
@@ -115,7 +115,7 @@ class ObjectiveSettings:
 
 @dataclass
 class HindsightSettings:
-    """Numbers of ``algorithm=hindsight``."""
+    """Settings of ``algorithm=hindsight``."""
 
     updates: int
     batch_size: int
@@ -186,7 +186,7 @@ class EntropySettings:
 
 @dataclass
 class EarlyStoppingSettings:
-    """When a training ends before ``total_frames``; success null: never."""
+    """Conditions for ending a training before ``total_frames``; success null: never."""
 
     success: float | None
     every: int

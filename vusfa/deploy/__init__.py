@@ -1,4 +1,4 @@
-"""Trained agents in use: at a camera, as ONNX, pretrained.
+"""Deployment of trained agents: at a camera, as ONNX, pretrained.
 
 >>> from vusfa.deploy import Navigator
 >>> navigator = Navigator.load("vusfa")  # doctest: +SKIP

@@ -1,7 +1,7 @@
-"""Trained agents by what they are stored in: a checkpoint, a safetensors file, or a pretrained name.
+"""Loading of trained agents from a checkpoint, a safetensors file, or by a pretrained name.
 
 A safetensors file holds the agent's ``state_dict`` as float16 and, as text in its header, what
-:func:`vusfa.modules.make_agent` needs, the names and the fingerprint of its scenes, and the goals trained on.
+:func:`vusfa.modules.make_agent` needs, the names and the fingerprint of its scenes, and its trained goals.
 Opening one runs no code.
 """
 
@@ -45,7 +45,7 @@ __all__ = [
 #: Where the package keeps its pretrained agents, NAME.safetensors with its model card NAME.md.
 PRETRAINED = Path(__file__).parent / "pretrained"
 _HEADER = {"agent_config": dict, "scenes": dict, "goals": list}
-#: What the values of a damaged header raise.
+#: Exceptions that a damaged header raises.
 _DAMAGED = (ValueError, TypeError, RuntimeError, OverflowError)
 _SCENES = {"sources": list, "names": list, "fingerprint": str}
 
@@ -56,8 +56,8 @@ class TrainedAgent(NamedTuple):
     Attributes:
         agent: in evaluation mode.
         scenes: the rooms.
-        goals: (G,) int64, global ids of the goals trained on.
-        card: its model card, Markdown with a YAML head; empty where it has none.
+        goals: (G,) int64, global ids of the trained goals.
+        card: its model card, Markdown with a YAML head; empty without one.
     """
 
     agent: Agent
@@ -72,10 +72,10 @@ def pretrained_names() -> list[str]:
 
 
 def check_name(name: str) -> str:
-    """The name, if there is a pretrained agent of it.
+    """Check the name of a pretrained agent and return it.
 
     Raises:
-        ConfigError: there is none.
+        ConfigError: there is no agent of this name.
 
     >>> check_name("vusfe")
     Traceback (most recent call last):
@@ -92,7 +92,7 @@ def load_pretrained(name: str, scenes: SceneSet | None = None) -> TrainedAgent:
     """Load an agent that comes with the package; nothing is downloaded.
 
     Args:
-        name: of :func:`pretrained_names`, such as ``"vusfa"``.
+        name: one of :func:`pretrained_names`, such as ``"vusfa"``.
         scenes: the bundled rooms, if they are open already.
 
     Raises:
@@ -117,7 +117,7 @@ def open_agent(source: str | os.PathLike[str], scenes: SceneSet | None = None) -
     Raises:
         CheckpointError: the file is missing, damaged, or of other scenes.
         SceneError: its scenes are not where they were.
-        ConfigError: a safetensors file, and the package of that name is missing.
+        ConfigError: the source is a safetensors file, and the package safetensors is missing.
 
     >>> open_agent("gvf").agent.config["model"]
     'gvf'
@@ -132,11 +132,11 @@ def open_agent(source: str | os.PathLike[str], scenes: SceneSet | None = None) -
 
 
 def rounded(weights: Mapping[str, Tensor], noise: float = 0.01) -> dict[str, Tensor]:
-    """Weights as float16; matrices as multiples of a power of two, for a compressed file a third smaller.
+    """Round weights to float16, matrices to multiples of a power of two: compressed files shrink by a third.
 
     Args:
         weights: float32 by name.
-        noise: root mean square of the rounding error over that of the matrix, at most.
+        noise: largest ratio of the root mean squares of rounding error and matrix.
 
     >>> found = rounded({"weight": torch.randn(64, 64)})["weight"]
     >>> found.dtype, len(found.unique()) < 500
@@ -159,7 +159,7 @@ def save_agent(path: str | os.PathLike[str], agent: Agent, scenes: SceneSet, goa
     """Write an agent as a safetensors file, atomically; :func:`rounded` rounds its weights.
 
     Args:
-        path: the file. Bundled rooms are noted by name, others by where they lie as seen from it.
+        path: the file. It names bundled rooms, and has paths of others relative to itself.
         agent, scenes, goals: as :class:`TrainedAgent` has them.
 
     Raises:
@@ -187,7 +187,7 @@ def save_agent(path: str | os.PathLike[str], agent: Agent, scenes: SceneSet, goa
 
 
 def read_agent(path: str | os.PathLike[str], scenes: SceneSet | None = None) -> TrainedAgent:
-    """Read a file of :func:`save_agent`; its weights become float32.
+    """Read a file of :func:`save_agent`, with weights as float32.
 
     Raises:
         CheckpointError: the file is missing, damaged, no agent of this package, or of other scenes.

@@ -1,4 +1,4 @@
-"""The backbone that made the features of a room, found by what the room's file says of it."""
+"""The backbone that made the features of a room, found by the attributes of the room's file."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ _OLD = "EfficientNet-lite0 extract_features mean over space; 224x224 bicubic res
 
 
 def find_backbone(scenes: SceneSet, backbone: str | Backbone | None = None) -> Backbone:
-    """Load the backbone that the features of these scenes come from, ready for single pictures.
+    """Load the backbone that made the features of these scenes, ready for single pictures.
 
     Args:
-        scenes: whose attributes name it.
+        scenes: scenes whose attributes name the backbone.
         backbone: the network itself, or its name, where the attributes name none or one whose weights are a
             file of the user's.
 
@@ -48,7 +48,7 @@ def find_backbone(scenes: SceneSet, backbone: str | Backbone | None = None) -> B
         if known is None:
             raise ConfigError(
                 f"scene {first!r} does not say which backbone made its features; pass it as"
-                " backbone=load_backbone(...), or make them anew with vusfa scenes encode"
+                " backbone=load_backbone(...), or recompute them with vusfa scenes encode"
             )
         if known != DEFAULT:
             raise ConfigError(
@@ -65,7 +65,7 @@ def find_backbone(scenes: SceneSet, backbone: str | Backbone | None = None) -> B
                 f"scene {first!r} has features of {key.removeprefix('feature_')} {brief(facts[key])}, not"
                 f" {brief(own[key])}; pass the backbone that made them"
             )
-    if found.preprocessing.crops == "ten":  # agents read the first of the ten, the one in the centre
+    if found.preprocessing.crops == "ten":  # agents read the first of the ten, the central one
         found = replace(found, preprocessing=replace(found.preprocessing, crops="centre"))
     return found
 

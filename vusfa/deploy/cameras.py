@@ -1,4 +1,4 @@
-"""Pictures one after the other: of a folder, a film, a camera, or an address that streams them."""
+"""Streams of pictures: from a folder, a film, a camera, or an http address."""
 
 from __future__ import annotations
 
@@ -29,14 +29,14 @@ _TIMEOUT = 10.0  # seconds
 
 
 def open_camera(source: str) -> Iterator[np.ndarray]:
-    """The pictures of a source, (H, W, 3) uint8 each.
+    """Open a source of pictures, (H, W, 3) uint8 each.
 
-    A folder's and a film's come in order, all of them. A camera's and a stream's are those of now: what came
-    while nobody asked is left out.
+    Folders and films give all pictures in order. Cameras and streams give the newest picture on each request
+    and drop those in between.
 
     Args:
-        source: a folder of JPEG and PNG files, read in the order of their names (2 before 10); a number, the
-            camera that OpenCV gives it; a film, read with OpenCV; or an http address of an MJPEG stream or of
+        source: a folder of JPEG and PNG files, read in the order of their names (2 before 10); a number, that
+            of a camera in OpenCV; a film, read with OpenCV; or an http address of an MJPEG stream or of
             a single picture, which is then fetched again each time.
 
     Raises:
@@ -77,7 +77,7 @@ def _folder(path: Path) -> Iterator[np.ndarray]:
 
 
 def _opencv(source: int | str, name: str) -> Iterator[np.ndarray]:
-    os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")  # faults are raised here
+    os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")  # faults are raised here instead
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
     try:
         cv2 = import_module("cv2")
@@ -109,7 +109,7 @@ def _of_film(cv2: Any, capture: Any) -> Generator[np.ndarray, None, None]:
 
 
 def _http(address: str) -> Iterator[np.ndarray]:
-    opener = build_opener(ProxyHandler({}))  # cameras are near
+    opener = build_opener(ProxyHandler({}))  # cameras are in the local network
     response = _open(opener, address)
     kind = response.headers.get_content_type()
     if kind == "multipart/x-mixed-replace":
@@ -162,7 +162,7 @@ def _read(response: Any, address: str) -> bytes:
 
 
 def _parts(response: Any, address: str) -> Generator[bytes, None, None]:
-    """Bodies of the parts of a multipart stream; ends with it."""
+    """Bodies of the parts of a multipart stream."""
     headers: Message = response.headers
     boundary = headers.get_param("boundary")
     if not isinstance(boundary, str) or not boundary.strip("-"):
@@ -188,7 +188,7 @@ def _parts(response: Any, address: str) -> Generator[bytes, None, None]:
 
 
 def _first_part(buffer: bytes, mark: bytes, ended: bool) -> tuple[bytes, bytes] | None:
-    """Body of the first whole part, and what follows it; None while none is whole."""
+    """Body of the first complete part, and the bytes after it; None while no part is complete."""
     _, found, rest = buffer.partition(mark)
     top, gap, body = rest.partition(b"\r\n\r\n")
     if not found or not gap:
@@ -204,7 +204,7 @@ def _first_part(buffer: bytes, mark: bytes, ended: bool) -> tuple[bytes, bytes] 
 
 
 def _newest(pictures: Generator[np.ndarray, None, None], name: str) -> Iterator[np.ndarray]:
-    """Of pictures that come by themselves, the newest at every call; a thread takes the others away."""
+    """Newest picture of a live source on each request; a thread drops the others."""
     arrived, stop = threading.Condition(), threading.Event()
     slot: list[Any] = [None, False, None]  # picture, whether it ended, fault
 

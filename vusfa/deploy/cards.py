@@ -1,7 +1,7 @@
 """Pretrained agents and their model cards, made from results and checkpoints by one command.
 
-The numbers of a card are the exact ones of its cell: expectations over all starts, with a 95 % interval over
-goals. Before anything is written the rounded agent is computed as the cell's was, and must give the same.
+The numbers of a card are the exact ones of its run: expectations over all starts, with a 95 % interval over
+goals. Before anything is written the rounded agent is evaluated as the run was, and must give the same.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from vusfa.training import load_agent
 
 __all__ = ["TOLERANCE", "card_head", "make_pretrained", "numbers", "write_log"]
 
-#: How far a mean of the rounded agent may be from its cell's, success and SPL in 0..1.
+#: Largest difference of a mean between the rounded agent and its run, success and SPL in 0..1.
 TOLERANCE = 0.005
 METRICS = ("success_500", "success_100", "spl")
 _LOGGED = 120  # rows of a learning curve
@@ -51,9 +51,9 @@ def numbers(exact: ExactGoals, scenes: SceneSet, trained: torch.Tensor) -> dict[
     """Mean and 95 % interval of every metric, over all goals, the trained, the unseen, and each room's.
 
     Args:
-        exact: of all goals.
+        exact: exact values of all goals.
         scenes: the world.
-        trained: (G,) global ids of the goals trained on.
+        trained: (G,) global ids of the trained goals.
 
     Returns:
         per group of goals and metric: value, low, high; six digits.
@@ -86,22 +86,22 @@ def make_pretrained(cell: Path, runs: Path, commit: str, out: Path = PRETRAINED)
 
     Args:
         cell: folder of the results, RESULTS/EXPERIMENT/RUN, such as ``results/table1/vusfa-0``.
-        runs: folder of the trainings; the checkpoint is RUNS/EXPERIMENT/RUN/NAME, the cell's NAME.
-        commit: of the code that trained.
+        runs: folder of the trainings; the checkpoint is RUNS/EXPERIMENT/RUN/NAME, with NAME from the results.
+        commit: commit of the code that trained.
         out: folder to write to.
 
     Returns:
         the safetensors file.
 
     Raises:
-        ResultError: the cell is missing or damaged, or has no exact values.
-        CheckpointError: the checkpoint is missing, damaged or not the cell's, or its rounded weights give
-            other numbers than the cell.
+        ResultError: the results are missing or damaged, or have no exact values.
+        CheckpointError: the checkpoint is missing, damaged or of another run, or its rounded weights give
+            other numbers than the results.
     """
     cell = cell.resolve()
     run = read_run(cell.parent.parent, cell.parent.name, cell.name)
     if run.exact is None:
-        raise ResultError(f"{cell}: has no exact values; take the cell of an agent of one frame")
+        raise ResultError(f"{cell}: has no exact values; take the run of an agent of one frame")
     if not re.fullmatch(r"[0-9a-f]{7,40}", commit):
         raise ResultError(f"commit is {commit!r}; give the hexadecimal digits of the commit that trained")
     check_folder(out, "out")
@@ -144,7 +144,7 @@ def write_log(log: Path, out: Path, frames: int) -> Path:
     Args:
         log: the file.
         out: file to write.
-        frames: of the checkpoint; later rows are left out.
+        frames: frames of the checkpoint; later rows are left out.
 
     Raises:
         ResultError: the log is damaged.

@@ -1,17 +1,17 @@
 """A navigator as one ONNX file, which needs neither torch nor this package to run.
 
-| input | type | shape | what it is |
+| input | type | shape | content |
 |---|---|---|---|
-| ``picture`` | uint8 | (B, S, S, 3) | what the camera sees, resized to the backbone's square |
+| ``picture`` | uint8 | (B, S, S, 3) | the camera's picture, resized to the backbone's square |
 | ``goal`` | float32 | (B, F) | ``features`` of the goal's picture, from a first call |
 | ``room`` | int64 | (B,) | index of the room, in the order of the metadata's ``scenes`` |
 | ``history`` | float32 | (B, H - 1, F) | ``features`` of the pictures before, oldest first; none for H = 1 |
 
-| output | type | shape | what it is |
+| output | type | shape | content |
 |---|---|---|---|
-| ``features`` | float32 | (B, F) | of the picture, to hand back as goal and history |
-| ``probabilities`` | float32 | (B, A) | of the actions |
-| ``similarity`` | float32 | (B,) | of the picture with the goal's |
+| ``features`` | float32 | (B, F) | features of the picture, to pass as goal and history |
+| ``probabilities`` | float32 | (B, A) | probabilities of the actions |
+| ``similarity`` | float32 | (B,) | similarity of the picture with the goal's |
 | ``rooms`` | float32 | (B, n) | similarity of the picture with the most similar state of each room |
 
 B, the batch, is any number. The metadata are strings: ``actions``, ``scenes`` (JSON lists), ``history``,
@@ -59,7 +59,7 @@ class _PickedLinear(nn.Module):
 
 
 class _Graph(nn.Module):
-    """What the file computes."""
+    """The exported computation."""
 
     mean: Tensor
     std: Tensor
@@ -96,12 +96,12 @@ def export_onnx(navigator: Navigator, path: str | os.PathLike[str]) -> Path:
     """Write a navigator as an ONNX file, atomically.
 
     Args:
-        navigator: of an agent of features, without a memory, whose backbone is a network of torch.
+        navigator: its agent reads features and has no memory; its backbone is a torch module.
         path: the file to write, replaced if it exists.
 
     Raises:
-        ConfigError: an agent or backbone that cannot be exported, packages that are missing, or a folder that
-            may not be written.
+        ConfigError: the agent or backbone cannot be exported, packages are missing, or the folder cannot be
+            written.
 
     >>> from vusfa.deploy import Navigator
     >>> export_onnx(Navigator.load("run/checkpoint.pt"), "agent.onnx")  # doctest: +SKIP
@@ -127,9 +127,9 @@ def export_onnx(navigator: Navigator, path: str | os.PathLike[str]) -> Path:
         inputs.append(torch.zeros(2, kept - 1, width))
         names.append("history")
     batch = torch.export.Dim("batch")
-    logging.getLogger("torch.onnx").setLevel(logging.ERROR)  # it reports what is not installed
+    logging.getLogger("torch.onnx").setLevel(logging.ERROR)  # it reports missing packages
     with warnings.catch_warnings(), torch.no_grad():
-        warnings.simplefilter("ignore")  # of torch's exporter about itself
+        warnings.simplefilter("ignore")  # those of torch's exporter
         program: Any = torch.onnx.export(
             _Graph(navigator).eval(),
             tuple(inputs),
@@ -198,7 +198,7 @@ def _metadata(navigator: Navigator) -> dict[str, str]:
 def largest_difference(
     navigator: Navigator, path: str | os.PathLike[str], goal: Any, pictures: Iterable[Any]
 ) -> float:
-    """Walk with the ONNX file and with PyTorch; the largest difference of probabilities and similarities.
+    """Largest difference of probabilities and similarities between the ONNX file and PyTorch over a walk.
 
     Args:
         navigator: the one that was exported.

@@ -1,6 +1,6 @@
-"""Trained agents on a model hub, by huggingface_hub's mixin: ``pip install 'vusfa[hub]'``.
+"""Trained agents on a model hub, with the mixin of huggingface_hub: ``pip install 'vusfa[hub]'``.
 
-Nothing is sent or fetched but by :meth:`HubAgent.push_to_hub` and :meth:`HubAgent.from_pretrained`. A
+Data are sent or fetched only by :meth:`HubAgent.push_to_hub` and :meth:`HubAgent.from_pretrained`. A
 repository holds ``agent.safetensors`` (:mod:`vusfa.deploy.agents`) and the model card as ``README.md``.
 """
 
@@ -51,7 +51,7 @@ class HubAgent(ModelHubMixin, library_name="vusfa"):
 
     @classmethod
     def open(cls, source: str | Path) -> HubAgent:
-        """The agent of a checkpoint, a safetensors file or a pretrained name."""
+        """Load the agent of a checkpoint, a safetensors file or a pretrained name."""
         return cls(open_agent(source))
 
     def _save_pretrained(self, save_directory: Path) -> None:

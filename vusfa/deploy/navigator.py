@@ -27,13 +27,13 @@ __all__ = ["Action", "Navigator", "reading_pictures"]
 
 
 class Action(NamedTuple):
-    """What to do now.
+    """The next action.
 
     Attributes:
-        name: of the action, such as ``MoveForward``.
-        index: of the action, 0 to A - 1.
-        confidence: probability that the policy gives the action, 0 to 1.
-        arrived: whether the picture is so similar to the goal's that the camera is taken to be there.
+        name: name of the action, such as ``MoveForward``.
+        index: index of the action, 0 to A - 1.
+        confidence: the policy's probability of the action, 0 to 1.
+        arrived: whether the similarity with the goal's picture has reached the threshold.
     """
 
     name: str
@@ -43,8 +43,7 @@ class Action(NamedTuple):
 
 
 class Navigator:
-    """A trained agent with all that lies between it and a camera: backbone, preprocessing, normalization,
-    history.
+    """A trained agent with backbone, preprocessing, normalization and history, for use at a camera.
 
     Args:
         agent: trained, in evaluation mode.
@@ -53,18 +52,18 @@ class Navigator:
             with convolutions of its own needs none.
         scene: name of the room that the camera is in; recognized from the goal's picture when not given.
         sample: draw actions from the policy; False takes the most probable one.
-        seed: of the draws.
+        seed: seed of the sampled actions.
         threshold: similarity from which on the goal counts as reached; calibrated on the rooms' own states
             when not given, see :mod:`vusfa.deploy.places`.
-        crop: cut the middle out of pictures of another aspect ratio than the rooms' pictures.
+        crop: cut the centre out of pictures of another aspect ratio than the rooms' pictures.
 
     Attributes:
         scene: name of the room; None before the first goal.
-        similarity: of the last picture with the goal's; None before the first.
-        threshold: see above.
+        similarity: similarity of the last picture with the goal's; None before the first.
+        threshold: see Args.
 
     Raises:
-        ConfigError: the backbone is unknown or another one, or a threshold that is no similarity.
+        ConfigError: the backbone is unknown or another one, or the threshold is not a similarity.
         SceneError: there is no such room.
 
     >>> from vusfa.modules import make_agent
@@ -116,10 +115,10 @@ class Navigator:
         backbone: str | Backbone | None = None,
         **options: Any,
     ) -> Navigator:
-        """The navigator of a checkpoint, or of a pretrained agent.
+        """Load the navigator of a checkpoint, or of a pretrained agent.
 
         Args:
-            checkpoint: of ``vusfa train``; a .safetensors file; or a name of ``vusfa pretrained list``.
+            checkpoint: one of ``vusfa train``; a .safetensors file; or a name of ``vusfa pretrained list``.
             scenes: those that it was trained in; opened as they were then, when not given.
             backbone, options: as for the class.
 
@@ -175,7 +174,7 @@ class Navigator:
 
     @torch.inference_mode()
     def act(self, picture: Any) -> Action:
-        """The next action, from what the camera sees now.
+        """The next action for the camera's current picture.
 
         Args:
             picture: path, PIL image, or uint8 (H, W, 3).
@@ -223,7 +222,7 @@ class Navigator:
 
     @torch.inference_mode()
     def _observe(self, picture: np.ndarray) -> tuple[Tensor, Tensor]:
-        """What the agent reads of a picture, and the features (F,) that say where it was taken."""
+        """The agent's input from a picture, and the features (F,) that locate it."""
         if self.backbone is not None:
             features = self.backbone(prepare(picture[None], self.backbone.preprocessing))[0]
             if len(features) != self.scenes.feature_size:
@@ -239,10 +238,10 @@ class Navigator:
 
 
 def reading_pictures(agent: Agent, scenes: SceneSet) -> Agent:
-    """The same agent, on the CPU, reading what a camera sees instead of the ids of states.
+    """Copy an agent to the CPU, with pictures of a camera as input instead of state ids.
 
     Args:
-        agent: trained.
+        agent: the trained agent.
         scenes: those that it was trained in.
     """
     kind = "pixels" if agent.config["encoder"] == "conv" else "features"

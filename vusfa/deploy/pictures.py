@@ -1,4 +1,4 @@
-"""Pictures as they come, checked and in the shape that the rooms' pictures have."""
+"""Checks of pictures from users, and cropping to the aspect ratio of the rooms' pictures."""
 
 from __future__ import annotations
 
@@ -18,21 +18,21 @@ from vusfa.scenes.pictures import check_scans, open_image
 
 __all__ = ["MIN_PICTURE_SIDE", "as_picture", "decode_upright", "in_shape"]
 
-#: Pixels of a picture's side; less shows nothing.
+#: Smallest side of a picture in pixels.
 MIN_PICTURE_SIDE = 16
-#: Width over height may differ by this part: rounding, and sensors of 4.03 to 3.
+#: Relative tolerance of width over height: rounding, and sensors of 4.03 to 3.
 _SAME_ASPECT = 0.03
 
 
 def decode_upright(encoded: bytes, name: str) -> np.ndarray:
-    """A JPEG or PNG file as (H, W, 3) uint8, turned as its camera says that it was held.
+    """A JPEG or PNG file as (H, W, 3) uint8, rotated by the orientation that its camera recorded.
 
     Args:
         encoded: the file's content.
-        name: what messages call it.
+        name: name in messages.
 
     Raises:
-        SceneError: it is no such picture, damaged, or larger than allowed.
+        SceneError: the file is no such picture, damaged, or larger than allowed.
 
     >>> decode_upright(b"GIF89a", "goal.gif")
     Traceback (most recent call last):
@@ -66,7 +66,7 @@ def read_upright(path: str | os.PathLike[str]) -> np.ndarray:
 
 
 def as_picture(picture: Any) -> tuple[np.ndarray, str]:
-    """Any picture as (H, W, 3) uint8, and what messages call it.
+    """Any picture as (H, W, 3) uint8, and its name in messages.
 
     Args:
         picture: path of a JPEG or PNG file, PIL image, or uint8 (H, W, 3) as array or tensor.
@@ -104,11 +104,11 @@ def as_picture(picture: Any) -> tuple[np.ndarray, str]:
 def in_shape(
     picture: np.ndarray, name: str, shapes: Sequence[tuple[int, int]], crop: bool = False
 ) -> np.ndarray:
-    """A picture of the same aspect ratio as the rooms' pictures.
+    """Check or crop a picture to the aspect ratio of the rooms' pictures.
 
     Args:
         picture: (H, W, 3) uint8.
-        name: what messages call it.
+        name: name in messages.
         shapes: height and width of the rooms' pictures, pixels; one of them is enough.
         crop: cut the middle out of a picture of another aspect ratio, instead of an error.
 

@@ -1,8 +1,8 @@
 r"""Similarity of pictures, and two thresholds calibrated on the states of the rooms.
 
-The similarity of two pictures is the cosine of their features, each feature first brought to mean 0 and
+The similarity of two pictures is the cosine of their features, each feature first standardized to mean 0 and
 deviation 1 over the states of the rooms (plain features are nearly parallel: the cosine of two different
-places is 0.6). To read it one must know how similar two *different* places of a room are, and the dump knows:
+places is 0.6). The thresholds depend on how similar two *different* places of a room are, as the dump tells:
 for every state take the similarity m(s) with the most similar other state of its room.
 
 - **arrived**: the 95th percentile of m. A picture that is more similar to the goal's than nearly every state
@@ -31,15 +31,15 @@ _AT_ONCE = 1024
 
 
 class Places(nn.Module):
-    """The states of rooms by their features.
+    """States of rooms by their features, and the calibrated thresholds.
 
     Args:
         features: (S, F) float32, room by room.
-        sizes: states of each room; they add up to S.
+        sizes: number of states per room, with sum S.
 
     Attributes:
         arrived: similarity from which on a picture counts as the goal's.
-        known: similarity with the most similar state that a picture of the rooms has at least.
+        known: lowest similarity of a picture of the rooms with its most similar state.
 
     >>> corners = torch.eye(6)
     >>> places = Places(corners, [4, 2])
@@ -57,7 +57,7 @@ class Places(nn.Module):
         super().__init__()
         self.sizes = list(sizes)
         deviation = features.std(0, correction=0)
-        # A feature that hardly ever changes would be nothing but noise.
+        # A feature that hardly varies would be pure noise.
         smallest = max(1e-3 * float(deviation.mean()), 1e-12)
         self.register_buffer("mean", features.mean(0))
         self.register_buffer("deviation", deviation.clamp(min=smallest))

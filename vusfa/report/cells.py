@@ -25,13 +25,13 @@ def read_source(source: str | Path, mode: str = "sampled", runs: str | Path = "r
     Args:
         source: folder of a run of vusfa train, of one run of results, or of a sweep or an experiment, all of
             whose runs are read; or the name of a pretrained agent, see
-            :func:`~vusfa.report.run_agents.pretrained_run`. ``NAME=FOLDER`` calls the model NAME. A sweep's
+            :func:`~vusfa.report.run_agents.pretrained_run`. ``NAME=FOLDER`` labels the model NAME. A sweep's
             ``multirun.yaml`` is no run.
         mode: of the evaluation, ``sampled`` or ``greedy``.
         runs: folder of logs and checkpoints, ``RUNS/EXPERIMENT/RUN``.
 
     Raises:
-        ConfigError: it is none of these, or a file cannot be read.
+        ConfigError: the source is none of these, or a file cannot be read.
         ResultError: the results are damaged.
 
     >>> read_source("/no/such/folder")
@@ -71,7 +71,7 @@ def result_run(folder: Path, label: str = "", mode: str = "sampled", runs: str |
 
     Args:
         folder: ``.../EXPERIMENT/RUN``.
-        label: of its model; its row's name by default.
+        label: label of its model; its row's name by default.
         mode, runs: see :func:`read_source`.
 
     Raises:

@@ -42,7 +42,7 @@ def report_runs(
 ) -> None:
     """Write one self-contained HTML page of runs and results.
 
-    Its tables are written beside it as CSV, unrounded, in the folder PAGE_tables. NAME=FOLDER calls a model
+    Its tables are written beside it as CSV, unrounded, in the folder PAGE_tables. NAME=FOLDER labels a model
     NAME, which must not be an option's; runs of one name are seeds of one model, unless their settings
     differ. vusfa report vusfa shows a pretrained agent, without a training.
 
@@ -50,17 +50,17 @@ def report_runs(
         sources: folders of runs of vusfa train, of results, of sweeps or of experiments; names of pretrained
             agents.
         out: the page.
-        title: of the page.
-        goals_per_scene: most goals per scene in the explorer; as many as megabytes allows by default.
+        title: title of the page.
+        goals_per_scene: limit of goals per scene in the explorer; by default as many as megabytes allows.
         seeds: runs per model in the explorer, the first ones given.
         walks: sampled episodes to each of these goals.
         max_steps: limit of actions of these episodes.
-        mode: of the evaluations in results.
+        mode: mode of the evaluations in results.
         runs: folder of the logs and checkpoints of results, RUNS/EXPERIMENT/RUN.
         scenes: bundled names and files, if they have moved since the training.
         megabytes: size limit of the page; goals, then pictures are left out to keep it.
         wandb: send the tables to W&B, too; offline leaves them beside the page.
-        project: of W&B.
+        project: project of W&B.
         threads: processor threads; more than 1 pays on an idle machine only.
     """
     set_threads(threads)
@@ -92,7 +92,7 @@ def report_runs(
 
 
 def _shown(source: str) -> str:
-    """A path as a page may tell it: relative to the present folder, or its last part alone."""
+    """A path as a page shows it: relative to the current folder, or its last part."""
     name, path = split_name(source)
     absolute = path.absolute()
     inside = absolute.is_relative_to(Path.cwd())

@@ -34,7 +34,7 @@ __all__ = ["Options", "add_pictures", "gather", "goal_limit", "tables"]
 
 Row = dict[str, Any]
 
-_BYTES_A_STATE = 16  # of one goal's maps, in base 64: value, three components, four probabilities
+_BYTES_A_STATE = 16  # of the maps of one goal, in base 64: value, three components, four probabilities
 _SHARE_OF_MAPS = 0.6
 
 
@@ -43,14 +43,14 @@ class Options:
     """Options of a page.
 
     Args:
-        title: of the page.
+        title: title of the page.
         within: limits of actions to report success for.
-        goals_per_scene: most goals per scene in the explorer; None for as many as the page's size allows.
+        goals_per_scene: limit of goals per scene in the explorer; None for as many as the page's size allows.
         seeds: runs per model in the explorer, the first ones.
         walks: sampled episodes to each of these goals. Those of agents of one frame are sampled in the page.
         max_steps: limit of actions of these episodes.
         megabytes: size limit of the page.
-        command: that makes the page again.
+        command: command that makes the page again.
         scenes: the runs' scenes, if they have moved, see
             :func:`~vusfa.report.run_scenes.open_scenes`.
         tell: called with a line of progress.
@@ -72,8 +72,8 @@ def tables(runs: Sequence[LoggedRun], scenes: Mapping[str, Scene], options: Opti
     """The report's tables by name: summary, seeds, distance, goals, runs.
 
     Args:
-        runs: of the report.
-        scenes: of :func:`~vusfa.report.run_scenes.open_scenes`.
+        runs: runs of the report.
+        scenes: those of :func:`~vusfa.report.run_scenes.open_scenes`.
         options: for ``within``.
     """
     world = SceneSet(scenes.values())
@@ -115,7 +115,7 @@ def gather(
     """The page's content without pictures (see :func:`add_pictures`).
 
     Args:
-        runs: of the report, at least one.
+        runs: runs of the report, at least one.
         options: see :class:`Options`.
         scenes: of :func:`~vusfa.report.run_scenes.open_scenes`; opened when not given.
 
@@ -175,7 +175,7 @@ def gather(
 
 
 def _metrics(rows: Mapping[str, Sequence[Row]]) -> list[Row]:
-    """How the page shows each metric, in order; ``exact`` marks those of the floor maps."""
+    """Display of each metric on the page, in order; ``exact`` marks those of the floor maps."""
     found = [(name, get_metric(name), False) for name in metric_columns(rows["summary"])]
     logged = dict.fromkeys(name for row in rows["goals"] for name in row if name.startswith("exact_"))
     for name in sorted(logged, key=lambda name: (not name[6:].isdigit(), name)):
@@ -312,7 +312,7 @@ def _symmetric(components: torch.Tensor) -> list[Row]:
     """One packed (G, N) per component, on a scale symmetric about 0 that cuts the few farthest values."""
     packed = []
     for part in components.unbind(-1):
-        sample = part.abs().flatten()[:: max(1, part.numel() // 100_000)]  # the most that quantile takes
+        sample = part.abs().flatten()[:: max(1, part.numel() // 100_000)]  # the limit of quantile
         end = float(torch.quantile(sample, 0.995)) or 1.0
         packed.append(pack(part, "u8", -end, end))
     return packed

@@ -17,7 +17,7 @@ def read_metrics(path: str | Path) -> dict[str, np.ndarray]:
     """The columns of a run's ``metrics.csv``, each (n,) float64; an empty field is NaN.
 
     Raises:
-        ConfigError: the file is missing, or a field is no number.
+        ConfigError: the file is missing, or a field is not a number.
     """
     columns = read_csv(path, ConfigError, "a run writes metrics.csv in its folder, see docs/training.md")
     return {name: column for name, column in columns.items() if len(column)}
@@ -26,14 +26,14 @@ def read_metrics(path: str | Path) -> dict[str, np.ndarray]:
 def plot_curve(
     metrics: str | Path, path: str | Path, random_walk: float | None = None, title: str = ""
 ) -> Path:
-    """Success and length over shortest path against frames, as PNG, atomically: of the evaluations during
-    the training, or, where there were none, of the episodes that ended.
+    """Draw success and length over shortest path against frames as PNG, atomically: those of evaluations
+    during the training or, without any, of the episodes that ended.
 
     Args:
         metrics: the run's ``metrics.csv``.
-        path: of the PNG.
+        path: the PNG.
         random_walk: success of the random walk, drawn as a line.
-        title: of the figure.
+        title: title of the figure.
 
     Raises:
         ConfigError: see :func:`read_metrics`; or there are no rows.

@@ -32,7 +32,7 @@ _PLAIN = (
     "grad_norm",
 )
 _PER_SCENE = ("success", "length", "length_ratio", *_EVALUATED[:4])
-#: Rates of the episodes that ended, which flatter a training's beginning: shown where runs lack evaluations.
+#: Rates of the episodes that ended, biased upwards early in a training: shown for runs without evaluations.
 _ENDED = ("success", "length_ratio")
 
 
@@ -67,7 +67,7 @@ def band(
 
     Args:
         curves: pairs of frames (n,), rising, and values (n,); NaN values are left out.
-        points: most common frames, spread evenly over all that occur.
+        points: largest number of common frames, spread evenly over all that occur.
 
     Returns:
         x, mean, low and high, lists of one length.

@@ -1,4 +1,4 @@
-"""Runs side by side that were evaluated on the same episodes, as one long table."""
+"""Runs that were evaluated on the same episodes, as one long table."""
 
 from __future__ import annotations
 
@@ -135,7 +135,7 @@ def read_experiment(root: str | Path, names: Sequence[str], scenes: SceneSet | N
 
 @lru_cache(maxsize=1)
 def _random_walk(scenes: SceneSet) -> ExactGoals:
-    """Kept, because several tables of the same rooms are often made in one go."""
+    """Exact random walk, cached for several tables of the same rooms."""
     return exact_goals(uniform_probabilities(scenes.num_actions), scenes)
 
 

@@ -100,7 +100,7 @@ def record_walk(
         max_steps: limit of actions.
         history: frames in ``state_id``.
         attempts: episodes, of which the shortest successful one is taken.
-        seed: of the actions; the caller's random state stays.
+        seed: seed of the actions; the caller's random state is unchanged.
         observe: see :func:`vusfa.evaluation.evaluate`.
 
     Returns:
@@ -120,7 +120,7 @@ def draw_film(scenes: SceneSet, trail: Sequence[int], goal: int, scale: int = 2)
         scenes: the world.
         trail: global ids of the visited states.
         goal: global id.
-        scale: of the scene's pictures.
+        scale: enlargement of the scene's pictures.
 
     >>> scenes = SceneSet.bundled(["bathroom"])
     >>> [picture.size for picture in draw_film(scenes, [72, 73], goal=73)]
@@ -161,7 +161,7 @@ def write_gif(path: str | Path, film: Sequence[Image.Image], frames_per_second: 
 
 
 def encode_gif(film: Sequence[Image.Image], frames_per_second: float = 4.0) -> bytes:
-    """A GIF as :func:`write_gif` writes it.
+    """Encode a GIF, as :func:`write_gif` writes it.
 
     >>> encode_gif([Image.new("RGB", (4, 4))])[:6]
     b'GIF89a'

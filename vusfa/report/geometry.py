@@ -14,8 +14,8 @@ from vusfa.scenes.poses import dart, step_length
 
 __all__ = ["blocked_edges", "dart_path", "floor_plan", "outline", "slices"]
 
-_HALF = 0.47  # of the square that a place is drawn as; the unit is the distance between neighbouring places
-_WHOLE = 359.9  # a slice of as many degrees is the whole square
+_HALF = 0.47  # half the side of a place's square; the unit is the distance between neighbouring places
+_WHOLE = 359.9  # a slice of this many degrees is the whole square
 
 
 def slices(location: np.ndarray, rotation: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -151,7 +151,7 @@ def floor_plan(scene: Scene) -> dict[str, Any]:
 
 
 def blocked_edges(scene: Scene, x: np.ndarray, y: np.ndarray) -> list[list[float]]:
-    """Edges of squares that a step forward cannot cross: a wall or furniture, a dump does not tell which.
+    """Edges of squares that MoveForward cannot cross: walls or furniture, which a dump does not distinguish.
 
     Args:
         scene: the scene; without an action MoveForward nothing is known.

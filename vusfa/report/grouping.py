@@ -15,7 +15,7 @@ from vusfa.report.runs import LoggedRun
 
 __all__ = ["separate_runs"]
 
-#: Settings that change nothing in what is learned, or that every seed has its own of.
+#: Settings that do not affect learning, or that differ between seeds.
 _IGNORED = ("seed", "folder", "resume", "threads", "device", "log_every", "checkpoint_every")
 _IGNORED_GROUPS = ("logger.", "evaluation.")
 _SAME_LENGTH = 0.98  # of the longest training
@@ -23,13 +23,13 @@ _SHOWN = 2  # differences in a label
 
 
 def separate_runs(runs: Sequence[LoggedRun]) -> tuple[list[LoggedRun], list[str]]:
-    """Give runs of one label that are not comparable labels of their own.
+    """Relabel runs of one label that are not comparable.
 
-    Runs are comparable that agree in every setting, in the length of their training, and in the goals and the
-    limit of actions of their evaluations. What a run does not tell makes no difference.
+    Runs are comparable if they agree in every setting, in the length of their training, and in the goals and
+    the limit of actions of their evaluations. What a run does not record is ignored.
 
     Args:
-        runs: of any labels.
+        runs: runs of any labels.
 
     Returns:
         the runs, relabelled where needed, and a line per label that was split, which says what differs.
@@ -76,7 +76,7 @@ def _facts(run: LoggedRun, longest: float) -> dict[str, Any]:
 
 
 def _spread_overrides(facts: Sequence[dict[str, Any]]) -> None:
-    """Results keep their command line instead of all settings: what one of them gives, the others leave."""
+    """Add missing overrides to results, which record their command line instead of all settings."""
     given = [
         dict(str(text).partition("=")[::2] for text in found.pop("overrides"))
         if "overrides" in found

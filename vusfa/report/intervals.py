@@ -43,5 +43,5 @@ def intervals(tables: Sequence[pd.DataFrame], scene: str, names: Sequence[str]) 
 
 @lru_cache(maxsize=4)
 def _draws(seeds: int, scene: tuple[int, ...]) -> Draws:
-    """Kept, because every metric of every model has the same ones."""
+    """Bootstrap draws, cached for all metrics and models."""
     return make_draws(seeds, torch.tensor(scene))

@@ -1,4 +1,4 @@
-"""Media of the evaluations during a training: a walk as a film, success by place."""
+"""Media of evaluations during a training: a walk as a film, success by place."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ STEPS, SCENES = 40, 8
 
 
 def draw_media(trainer: Trainer, success: Tensor, goals: Tensor) -> dict[str, bytes]:
-    """Media of an agent in training.
+    """Draw media of an agent in training.
 
     Args:
-        trainer: of the agent; its weights and the random state stay as they are.
+        trainer: the agent's trainer; weights and random state are unchanged.
         success: (S,) probability of success from each state; NaN: unknown.
         goals: (G,) global ids of the validation goals.
 

@@ -41,7 +41,7 @@ def make_page(content: Mapping[str, Any]) -> str:
         ConfigError: Plotly is not installed.
     """
     plotly, script = _plotly(), "\n".join(_asset(name) for name in _SCRIPTS)
-    # Plotly adds an empty sheet, which it fills rule by rule, and the sheets of its maps.
+    # Plotly adds an empty style sheet, which it fills rule by rule, and those of its maps.
     styles = [_asset("page.css"), "", *re.findall(r"\.textContent='([^'\\]*)'", plotly)]
     parts = {
         "hashes": " ".join(map(_hash, (plotly, script))),
@@ -92,7 +92,7 @@ def even(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
 
 
 def _hash(text: str) -> str:
-    """A script or a sheet of styles for the page's Content-Security-Policy, which lets no other one in."""
+    """Hash of a script or style sheet for the page's Content-Security-Policy, which blocks all others."""
     return f"'sha256-{b64encode(sha256(text.encode()).digest()).decode()}'"
 
 

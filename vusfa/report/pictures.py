@@ -16,7 +16,7 @@ __all__ = ["small_jpeg", "thumbnails"]
 
 
 def small_jpeg(picture: Any, width: int = 200, quality: int = 60) -> bytes:
-    """A picture (H, W, 3) uint8 as JPEG, scaled down to a width at most.
+    """A picture (H, W, 3) uint8 as JPEG, scaled down to at most a width.
 
     >>> import numpy as np
     >>> small_jpeg(np.zeros((150, 200, 3), np.uint8))[:2] == bytes([0xFF, 0xD8])

@@ -47,7 +47,7 @@ def print_tables(
 
     Args:
         experiments: folders of results, shown together; or generalise alone.
-        results: where they lie.
+        results: their folder.
         out: folder for the CSV files; RESULTS/tables when not given.
         docs: write the tables that the documentation shows to this folder (docs/generated), and print none.
         plot: draw success to trained and to unseen goals as PNG.
@@ -110,6 +110,6 @@ def _print(experiment: Experiment, folder: Path, resamples: int, plot: Path | No
 
 
 def _show(title: str, rows: list[dict[str, object]], columns: list[str]) -> None:
-    """A table with its title; nothing for no rows."""
+    """Print a table with its title, if it has rows."""
     if rows:
         print(f"### {title}\n\n{markdown(rows, columns)}\n")

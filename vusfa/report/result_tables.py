@@ -1,4 +1,4 @@
-"""The tables of an experiment: every number with its interval, beside the random walk and the shortest path.
+"""Tables of an experiment: numbers with intervals, beside the random walk and the shortest path.
 
 Rows are dictionaries; a number with an interval is an :class:`~vusfa.evaluation.statistics.Estimate`. Means
 are over goals, each of which weighs the same, unless a row says "mean of scenes".
@@ -48,7 +48,7 @@ __all__ = [
 Row = dict[str, Any]
 
 COMPARED = ("success_500", "success_100", "spl")
-#: Trained goals count as solved from this share of their episodes on.
+#: Share of successful episodes from which trained goals count as solved.
 SOLVED = 0.9
 
 
@@ -58,14 +58,14 @@ def columns() -> list[str]:
 
 
 def run_rows(experiment: Experiment) -> list[Row]:
-    """One row per run: how long it was trained, whether it has solved the trained goals, and how far sampled
-    and exact success are apart.
+    """One row per run: length of the training, whether the trained goals are solved, and the difference of
+    sampled and exact success.
 
     Returns:
         rows with model, seed, run, frames, checkpoint, training_s, cell_s, trained (success within 500),
-        solved, exact_z: the sampled success less the exact one in standard deviations. Starts are drawn
+        solved, exact_z: the sampled success minus the exact one in standard deviations. Starts are drawn
         uniformly, so an episode to goal g succeeds with the probability p_g, and the deviation is that of
-        ``sum_g p_g (1 - p_g) / n_g``. NaN where there is no exact one.
+        ``sum_g p_g (1 - p_g) / n_g``. NaN without exact values.
     """
     rows = []
     for label, runs in experiment.runs.items():
@@ -226,7 +226,7 @@ def _draws(seeds: int, scene: Tensor, resamples: int) -> Draws:
 
 @lru_cache(maxsize=8)
 def _kept_draws(seeds: int, scene: tuple[int, ...], resamples: int) -> Draws:
-    """Made once, for all the tables of these goals."""
+    """Bootstrap draws, cached for all tables of these goals."""
     return make_draws(seeds, torch.tensor(scene), resamples=resamples)
 
 

@@ -23,7 +23,7 @@ _DRAWN = {"floor": "furniture", "hung": "furniture", "rug": "rug", "door": "door
 
 
 def plan_of(scene: Scene) -> Plan | None:
-    """The plan that a scene was rendered from; None where it is not known.
+    """The plan that a scene was rendered from; None if unknown.
 
     Args:
         scene: the scene.
@@ -49,7 +49,7 @@ def plan_of(scene: Scene) -> Plan | None:
 
 
 def plan_shapes(plan: Plan, scene: Scene) -> dict[str, Any]:
-    """What a plan shows from above, in metres.
+    """Shapes of a plan seen from above, in metres.
 
     Args:
         plan: of :func:`plan_of`.

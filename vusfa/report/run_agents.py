@@ -24,13 +24,13 @@ _EPISODES = 2  # per goal
 
 
 class SavedAgent(NamedTuple):
-    """An agent with what a page tells of it.
+    """An agent with what a page shows of it.
 
     Attributes:
         agent: in evaluation mode.
         scenes: those of its training.
         goals: (G,) global ids of its trained goals.
-        frames: of its training.
+        frames: length of its training.
         gamma: its discount; None if unknown.
     """
 
@@ -96,7 +96,7 @@ def pretrained_run(name: str, label: str = "") -> LoggedRun:
 def pretrained_of(run: LoggedRun) -> LoggedRun:
     """A run of results with the package's own agent, where that is of the very same training.
 
-    Frames and seconds of the training tell: no two trainings took the same time to a tenth of a second.
+    Frames and seconds identify a training: no two took the same time to a tenth of a second.
     """
     if run.checkpoint is not None:
         return run

@@ -78,7 +78,7 @@ def _equal(one: Scene, other: Scene) -> bool:
 
 
 def _check_episodes(run: LoggedRun, world: SceneSet | None) -> None:
-    """Refuse episodes of other scenes than the run's: their shortest paths tell."""
+    """Refuse episodes of other scenes than the run's, found by their shortest paths."""
     if run.episodes is None or world is None:
         return
     for index, name in enumerate(run.episodes.scene_names):

@@ -28,7 +28,7 @@ __all__ = ["LoggedRun", "read_episodes", "read_run", "run_label", "split_name"]
 
 _EVALUATIONS = ("zero_shot", "evaluation")
 _AGAIN = "evaluate the run again with vusfa evaluate"
-#: Types of what a report reads of a run's settings, where they are there.
+#: Types of the settings that a report reads from a run, if present.
 _SETTINGS: dict[str, Any] = {
     "agent": dict,
     "env": dict,
@@ -51,18 +51,18 @@ class LoggedRun:
     """One training: its log, its checkpoint and its evaluation.
 
     Args:
-        label: of its model; runs of one label are seeds of one model.
-        seed: of the training.
-        folder: of the run.
-        settings: of the training, plain.
+        label: label of its model; runs of one label are seeds of one model.
+        seed: seed of the training.
+        folder: folder of the run.
+        settings: settings of the training, plain.
         curves: columns of metrics.csv by name, each (n,) float64 with NaN where nothing was logged.
-        episodes: of its evaluation, or None.
+        episodes: those of its evaluation, or None.
         references: rows of the evaluation's other policies (random walk, shortest path, ...).
         checkpoint: path of its weights, or None.
         variant: how actions were taken in the evaluation: "sampled" or "greedy".
         exact: its goals' exact probabilities, or None.
         facts: frames and seconds of the training, if there is no log.
-        fingerprint: of the scenes of the training, if known; that of the checkpoint comes first.
+        fingerprint: hash of the scenes of the training, if known; that of the checkpoint comes first.
     """
 
     label: str
@@ -82,7 +82,7 @@ class LoggedRun:
         """Its evaluation as a long table, see :mod:`vusfa.evaluation.long_table`.
 
         Raises:
-            ValueError: it has none.
+            ValueError: the run has no evaluation.
         """
         if self.episodes is None:
             raise ValueError(f"{self.name} has no evaluation")
@@ -125,7 +125,7 @@ def read_run(source: str | Path) -> LoggedRun:
     """Read one run.
 
     Args:
-        source: its folder; ``LABEL=FOLDER`` calls its model LABEL.
+        source: its folder; ``LABEL=FOLDER`` labels its model LABEL.
 
     Raises:
         ConfigError: there is no such folder, no config.json in it, or a file cannot be read.
@@ -228,7 +228,7 @@ def split_name(source: str | Path) -> tuple[str, Path]:
 
 
 def _evaluation(folder: Path) -> tuple[Episodes | None, list[dict[str, Any]], str]:
-    """The run's evaluation with the most goals; of equals, that of ``vusfa evaluate``."""
+    """The run's evaluation with the most goals; among equals, that of ``vusfa evaluate``."""
     found: list[tuple[int, Episodes, list[dict[str, Any]], str]] = []
     for stem in _EVALUATIONS:
         table, summary = folder / f"{stem}_episodes.csv", folder / f"{stem}.json"

@@ -137,15 +137,15 @@ def baseline_rows(runs: Sequence[LoggedRun], scenes: SceneSet, within: Sequence[
 
 
 def reference_rows(run: LoggedRun, scenes: SceneSet, within: Sequence[int] = WITHIN) -> list[Row]:
-    """What a run stands between, on its own goals: the random walk, exactly, and the shortest path.
+    """Reference baselines on a run's own goals: the random walk, computed exactly, and the shortest path.
 
     Args:
         run: one with an evaluation.
         scenes: the scenes that it names, and perhaps more.
-        within: numbers of actions to give the success for.
+        within: limits of actions to report success for.
 
     Raises:
-        ValueError: it has no evaluation.
+        ValueError: the run has no evaluation.
     """
     table = run.episodes
     if table is None:
@@ -187,7 +187,7 @@ def run_rows(runs: Sequence[LoggedRun]) -> list[Row]:
 
 
 def _goals(run: LoggedRun) -> str:
-    """The setting of the goals: ids, a rule, or the name of a manifest."""
+    """Setting of the goals: ids, a rule, or the name of a manifest."""
     goals = run.settings.get("env", {}).get("goals", "")
     return Path(goals).name if isinstance(goals, str) else str(goals)
 

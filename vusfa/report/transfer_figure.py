@@ -46,7 +46,7 @@ def mean_over(values: Sequence[Sequence[float]]) -> Estimate:
     """Mean over seeds and sets of goals with its bootstrap interval, NaN left out.
 
     Args:
-        values: of each seed, of each set.
+        values: one per seed and set of goals.
 
     >>> mean_over([[1.0, 3.0], [1.0, 3.0]]).value
     2.0
@@ -112,7 +112,7 @@ def difference_table(runs: Sequence[Run]) -> str:
     """Markdown: differences of the mean length over the training, paired by seed and set of goals, with 95 %
     intervals: of each model fine-tuned from the same model from scratch, and of neighbors fine-tuned.
 
-    Less than 0: fewer actions than what it is compared with.
+    Below 0: fewer actions than the one it is compared with.
 
     Args:
         runs: of the experiment; the seeds that both sides of a pair have count.

@@ -22,7 +22,7 @@ _GAP = "in 100, less the random walk"
 
 def unseen_table(runs: Sequence[Run]) -> str:
     """Markdown: success and SPL of each policy in the rooms of the test, and its success within 100 actions
-    less that of the random walk, in percentage points; with 95 % bootstrap intervals over seeds and goals,
+    minus that of the random walk, in percentage points; with 95 % bootstrap intervals over seeds and goals,
     goals drawn within their rooms.
 
     Args:

@@ -174,7 +174,7 @@ def test_a_lintel_is_walked_under_and_shows_no_wall() -> None:
             id="furniture",
         ),
         pytest.param(
-            "size: [3, 3, 3]\ncamera: {resolution: [100000, 2]}", "at most 4096 a side", id="picture"
+            "size: [3, 3, 3]\ncamera: {resolution: [100000, 2]}", "at most 4096 per side", id="picture"
         ),
         pytest.param("size: " + "[" * 5000, "nested more than 20 deep", id="deep"),
     ],

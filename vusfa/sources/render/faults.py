@@ -36,7 +36,7 @@ def _numbers(plan: Plan) -> Iterator[str]:
     if min(camera.resolution) < 1:
         yield f"camera.resolution: {list(camera.resolution)} must be two whole numbers above 0"
     if max(camera.resolution) > MAX_PICTURE_SIDE:
-        yield f"camera.resolution: {list(camera.resolution)} must be at most {MAX_PICTURE_SIDE} a side"
+        yield f"camera.resolution: {list(camera.resolution)} must be at most {MAX_PICTURE_SIDE} per side"
     if camera.samples < 1:
         yield f"camera.samples: {camera.samples} must be 1 or more"
     if camera.exposure is not None and not camera.exposure > 0:
