@@ -36,6 +36,9 @@ def scenes(make_scene: Callable[..., Scene]) -> SceneSet:
         ({"batch_size": 4}, r"batch_size is 4; give a list, \[4\]"),
         ({"batch_size": "four"}, "batch_size is 'four'; give a list"),
         ({"batch_size": 2.5}, "batch_size is 2.5; give a list"),
+        ({"batch_size": [-1]}, r"batch_size is \[-1\]; give lengths of 1 or more"),
+        ({"batch_size": [2, -3]}, r"batch_size is \[2, -3\]; give lengths"),
+        ({"batch_size": [0]}, r"batch_size is \[0\]; give lengths"),
         ({"seed": -1}, "seed is -1; give a whole number of 0 or more"),
         ({"seed": 1.5}, "seed is 1.5"),
         ({"seed": 2**64}, "seed is 18446744073709551616"),
@@ -84,6 +87,9 @@ def test_a_step_without_what_it_reads(scenes: SceneSet, left: list[str]) -> None
         (torch.tensor([1, 200], dtype=torch.uint8), "action 200 does not exist"),
         (torch.tensor([1.7, 0.0]), "actions are torch.float32"),
         (torch.tensor([True, False]), "actions are torch.bool"),
+        (torch.tensor([[0], [1]]), r"actions are of shape \[2, 1\]; give \[2\]"),
+        (torch.tensor([[0, 1], [1, 0]]), r"actions are of shape \[2, 2\]"),
+        (torch.zeros(2, 0, dtype=torch.int64), r"actions are of shape \[2, 0\]"),
     ],
 )
 def test_actions(scenes: SceneSet, action: torch.Tensor, message: str) -> None:

@@ -160,6 +160,8 @@ def step(
     ([[1, 2]], 1.0, True, True)
     """
     action = check_actions(action, successor.shape[-1])
+    if action.ndim and action.shape != state_id.shape[:-1]:
+        raise ActionError(f"actions are of shape {[*action.shape]}; give {[*state_id.shape[:-1]]}")
     current = state_id[..., -1]
     state = successor[current, action]
     collided = blocked[current, action].unsqueeze(-1)

@@ -86,6 +86,8 @@ class SceneEnv(StatelessEnv):
             size = torch.Size(batch_size)
         except TypeError as error:
             raise ConfigError(f"batch_size is {brief(batch_size)}; give a list, [64]") from error
+        if any(length < 1 for length in size):
+            raise ConfigError(f"batch_size is {brief(batch_size)}; give lengths of 1 or more, [64]")
         super().__init__(device=torch.device("cpu"), batch_size=size)
         self.scenes = scenes.to("cpu")
         self.history = history
