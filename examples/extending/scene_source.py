@@ -74,9 +74,7 @@ def register(scenes: typer.Typer) -> None:
     scenes.command("grid-world")(grid_world)
 
 
-COMMANDS.append(
-    __name__
-)  # the registry line; permanently: write the module's name into vusfa/cli/__init__.py
+COMMANDS.append(__name__)  # the registry line; to stay: the module's name in vusfa/cli/__init__.py
 
 if __name__ == "__main__":
     main(["scenes", *sys.argv[1:]])

@@ -52,7 +52,7 @@ is read is resumed and trained on.
 
 ## What is refused when
 
-- *Pictures of a scene.* Opening a scene decodes one. `vusfa scenes check` and `vusfa scenes fetch` first
+- *Pictures of a scene.* Opening a scene decodes one. `check` and `fetch` of `vusfa scenes` first
   look at the header and the end of every picture, so that one that is cut off, of another size or no
   picture is found in seconds, wherever it lies. Then `check` decodes all of them: it is asked for
   everything, and in a large room takes longer than 10 seconds to find damage in the middle of a picture.

@@ -49,5 +49,5 @@ def test_all_tables(recipe: Callable[[str], Any], tmp_path: Path, capsys: pytest
 
 
 def test_no_results(recipe: Callable[[str], Any], tmp_path: Path) -> None:
-    with pytest.raises(ResultError, match=r"run recipes/table1\.py first"):
+    with pytest.raises(ResultError, match="run vusfa table1 first"):
         recipe("tables").tables(results=tmp_path)

@@ -154,8 +154,8 @@ def test_all_loggers_hear_of_a_run(
     assert [row["frames"] for row in rows if evaluated <= row.keys()] == [240, 480]
     assert not any(evaluated & row.keys() for row in rows if row["frames"] not in (240, 480))
     aliases = [r["artifact"]["aliases"] for r in records if r.get("artifact", {}).get("type") == "model"]
-    assert aliases[0] == ["latest", "best"]
-    assert aliases[-1][0] == "latest"
+    assert set(aliases[0]) == {"latest", "best"}  # wandb keeps them in no order
+    assert "latest" in aliases[-1]
     assert (tmp_path / "run" / "best.pt").is_file()
     assert list((tmp_path / "run" / "tensorboard").glob("events*"))
 

@@ -48,7 +48,7 @@ def test_run_and_show(
 
 def test_what_is_missing(recipe: Callable[[str], Any], folders: dict[str, Path], tmp_path: Path) -> None:
     transfer = recipe("transfer")
-    with pytest.raises(CheckpointError, match=r"checkpoint\.pt: missing; run recipes/table1"):
+    with pytest.raises(CheckpointError, match=r"checkpoint\.pt: missing; run vusfa table1"):
         transfer.run(models=["gvf"], seeds=[0], results=folders["results"], runs=tmp_path)
-    with pytest.raises(VusfaError, match=r"run recipes/transfer\.py run first"):
+    with pytest.raises(VusfaError, match="run vusfa transfer run first"):
         transfer.show(results=folders["results"])

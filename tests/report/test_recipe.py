@@ -35,6 +35,6 @@ def test_faults_in_one_line(tmp_path: Path):
     assert (
         done.stderr
         == f"error: {tmp_path / 'none'} is not a folder; give the folder of a run or of results, or"
-        " a pretrained agent (gvf, sfdp, usfa, vusfa)\n"
+        " a pretrained agent (gvf, sfdp, usfa, vusfa, vusfa-replay-search)\n"
     )
     assert not list(tmp_path.iterdir())
