@@ -4,14 +4,12 @@ from __future__ import annotations
 
 from typing import Any
 
-import numpy as np
 import torch
-from scipy.sparse import csr_array
-from scipy.sparse.csgraph import dijkstra
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from vusfa.errors import ConfigError
+from vusfa.scenes.paths import ShortestPaths
 
 __all__ = ["ExperienceGraph", "passing_weights"]
 
@@ -63,7 +61,7 @@ class ExperienceGraph:
     def __init__(self, num_states: int, num_actions: int) -> None:
         self.successor = torch.full((num_states, num_actions), -1)
         self.scene_of = torch.full((num_states,), -1)
-        self._scenes: dict[int, tuple[Tensor, csr_array]] = {}
+        self._scenes: dict[int, tuple[Tensor, Tensor, ShortestPaths]] = {}
         self._goals = torch.empty(0, dtype=torch.int64)
 
     @property
@@ -111,18 +109,17 @@ class ExperienceGraph:
         scene = self.scene_of[goals].unique()
         if len(scene) != 1 or int(scene) < 0:
             raise ValueError(f"goals {goals[:5].tolist()} are not seen states of one scene")
-        states, reversed_graph = self._scene(int(scene))
-        steps = dijkstra(reversed_graph, indices=torch.searchsorted(states, goals).numpy(), unweighted=True)
-        return states, torch.from_numpy(np.where(np.isfinite(steps), steps, -1).astype(np.int64))
+        states, _, paths = self._scene(int(scene))
+        return states, paths.to_goals(torch.searchsorted(states, goals)).long()
 
-    def _scene(self, scene: int) -> tuple[Tensor, csr_array]:
-        """A scene's seen states, and its transitions backwards between their places among these."""
+    def _scene(self, scene: int) -> tuple[Tensor, Tensor, ShortestPaths]:
+        """A scene's seen states (N,), the places of their successors among these (N, A), -1 where unknown,
+        and the shortest paths of this graph."""
         if scene not in self._scenes:
             states = (self.scene_of == scene).nonzero().squeeze(-1)
-            place, action = (self.successor[states] >= 0).nonzero(as_tuple=True)
-            following = torch.searchsorted(states, self.successor[states[place], action])
-            edges = np.ones(len(place)), (following.numpy(), place.numpy())
-            self._scenes[scene] = states, csr_array(edges, shape=(len(states), len(states)))
+            following = self.successor[states]
+            place = torch.where(following < 0, -1, torch.searchsorted(states, following))
+            self._scenes[scene] = states, place, ShortestPaths(place.numpy())
         return self._scenes[scene]
 
     def sample(self, num_goals: int, batch_size: int, path_share: float = 0.5) -> TensorDict:
@@ -146,14 +143,13 @@ class ExperienceGraph:
         goals = goals[self.scene_of[goals].argsort(stable=True)]
         parts = []
         for scene in self.scene_of[goals].unique().tolist():
-            states, steps = self.steps_to(goals[self.scene_of[goals] == scene])
-            following = self.successor[states]
-            place = torch.searchsorted(states, following.clamp(min=0)).clamp(max=len(states) - 1)
-            for goal, distance in zip(goals[self.scene_of[goals] == scene], steps, strict=True):
-                after = distance[place].masked_fill(following < 0, -1)  # (N, A), -1 where unknown
-                after = torch.where(after < 0, len(self.successor), after)
+            chosen = goals[self.scene_of[goals] == scene]
+            states, steps = self.steps_to(chosen)
+            _, place, _ = self._scene(scene)
+            for goal, distance in zip(chosen, steps, strict=True):
                 drawn = _draw(distance, batch_size // num_goals, path_share)
-                ahead = after[drawn]
+                ahead = torch.where(place[drawn] < 0, -1, distance[place[drawn]])  # -1: no known path
+                ahead = torch.where(ahead < 0, len(states), ahead)
                 parts.append(
                     {
                         "state_id": states[drawn].unsqueeze(-1),
