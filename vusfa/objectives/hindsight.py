@@ -21,7 +21,7 @@ from torch import Tensor
 
 from vusfa.objectives.distribution import action_log_prob
 from vusfa.objectives.functional import assert_same_shape
-from vusfa.objectives.network_loss import NetworkLoss, weighted_mean
+from vusfa.objectives.goal_loss import GoalLoss, weighted_mean
 from vusfa.objectives.networks import entry, run_actor_critic, run_critic, select_inputs
 
 __all__ = ["HindsightKeys", "HindsightLoss", "expectile_loss", "relabelled_target", "walked_return"]
@@ -107,7 +107,7 @@ class HindsightKeys:
     value: NestedKey = "state_value"
 
 
-class HindsightLoss(NetworkLoss):
+class HindsightLoss(GoalLoss):
     r"""Value and policy for goals named in hindsight, from single transitions of any policy.
 
     .. math::
@@ -156,7 +156,8 @@ class HindsightLoss(NetworkLoss):
     _AcceptedKeys = HindsightKeys
     default_keys = HindsightKeys
     tensor_keys: HindsightKeys
-    _schedulable_buffers = frozenset({"critic_coeff", "objective_coeff"})
+    terms = ("loss_hindsight_critic", "loss_hindsight_objective")
+    logged = ("hindsight_value", "hindsight_advantage")
 
     def __init__(
         self,
@@ -174,26 +175,28 @@ class HindsightLoss(NetworkLoss):
         reduction: Literal["none", "mean", "sum"] | None = "mean",
         functional: bool = True,
     ) -> None:
-        for name, value in (("gamma", gamma), ("expectile", expectile)):
-            if not 0 < value < 1:
-                raise ValueError(f"HindsightLoss: {name} is {value}; give a number between 0 and 1")
+        if not 0 < expectile < 1:
+            raise ValueError(f"HindsightLoss: expectile is {expectile}; give a number between 0 and 1")
         for name, value in (("temperature", temperature), ("max_weight", max_weight)):
             if not value > 0:
                 raise ValueError(f"HindsightLoss: {name} is {value}; give a number above 0")
         super().__init__(
-            {"actor_network": actor_network, "critic_network": critic_network},
+            actor_network,
+            critic_network,
+            critic_coeff=critic_coeff,
+            objective_coeff=objective_coeff,
+            gamma=gamma,
+            goal_reward=goal_reward,
+            step_reward=step_reward,
             reduction=reduction,
             functional=functional,
         )
-        self._register_coefficients(critic_coeff=critic_coeff, objective_coeff=objective_coeff)
-        self.gamma, self.expectile = gamma, expectile
-        self.temperature, self.max_weight = temperature, max_weight
-        self.goal_reward, self.step_reward = goal_reward, step_reward
+        self.expectile, self.temperature, self.max_weight = expectile, temperature, max_weight
         self._set_action_keys()
 
     def check(self) -> None:
         """Raise where the critic lacks an entry; ``forward`` does so, too."""
-        self._check_written("value")
+        super().check()
         read, state = [unravel_key(key) for key in self.critic_network.in_keys], self.tensor_keys.state
         if unravel_key(state) not in read:
             raise ValueError(
@@ -205,13 +208,6 @@ class HindsightLoss(NetworkLoss):
         keys = self.tensor_keys
         own = [keys.state, keys.goal, *self._action_keys(), keys.steps_to_goal, ("next", keys.state)]
         return [*own, *self.actor_network.in_keys, *self.critic_network.in_keys]
-
-    def _default_out_keys(self) -> list[NestedKey]:
-        present = {
-            "loss_hindsight_critic": self.critic_coeff is not None,
-            "loss_hindsight_objective": self.objective_coeff is not None,
-        }
-        return [*(key for key in present if present[key]), "hindsight_value", "hindsight_advantage"]
 
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -244,9 +240,7 @@ class HindsightLoss(NetworkLoss):
         with torch.no_grad():
             target = relabelled_target(next_value, following[..., -1] == goal, self.gamma, **rewards)
             walked = walked_return(steps, self.gamma, **rewards)
-            counts = state[..., -1] != goal
-            valid = self._valid(tensordict, counts)
-            counts = counts if valid is None else counts & valid
+            counts = self._counted(tensordict, state[..., -1] != goal)
             advantage = target - value
             weight = (advantage / self.temperature).exp().clamp(max=self.max_weight)
             weight = torch.where(counts, weight, 0.0)

@@ -15,7 +15,7 @@ from torchrl.objectives.common import LossModule
 
 from vusfa.objectives.networks import use_params
 
-__all__ = ["NetworkLoss", "weighted_mean"]
+__all__ = ["NetworkLoss"]
 
 # what a loss reads of each network, the agent's method that gives such a network, and what else will do
 _NETWORKS = {
@@ -152,24 +152,6 @@ class NetworkLoss(LossModule):
         masks = [tensordict.get(key, None) for key in self._loss_mask_keys()]
         expanded = [self._expand_loss_mask(mask, like) for mask in masks if mask is not None]
         return torch.stack(expanded).all(0) if expanded else None
-
-    def _value(self, written: TensorDictBase) -> Tensor:
-        """V, (*batch,), float32 or more."""
-        value = written.get(self.tensor_keys.value).squeeze(-1)
-        return value.to(torch.promote_types(value.dtype, torch.float32))
-
-    def _weighted(self, coefficient: Tensor, values: Tensor, weight: Tensor) -> Tensor:
-        if self.reduction == "mean":
-            return weighted_mean(coefficient, values, weight)
-        # select, not multiply: what a mask hides may be infinite
-        values = coefficient * (weight * torch.where(weight > 0, values, 0.0))
-        return values if self.reduction == "none" else values.sum()
-
-
-def weighted_mean(coefficient: float | Tensor, values: Tensor, weight: Tensor) -> Tensor:
-    """The weighted mean, times a coefficient; 0 where every weight is 0."""
-    total = (weight * torch.where(weight > 0, values, 0.0)).sum()
-    return coefficient * total / weight.sum().clamp(min=torch.finfo(weight.dtype).tiny)
 
 
 def _check_network(loss: str, argument: str, network: object) -> None:

@@ -9,18 +9,17 @@ return of a path of known length is known (:func:`~vusfa.objectives.walked_retur
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
 
 import torch
 from tensordict import TensorDict, TensorDictBase
-from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModuleBase, dispatch
+from tensordict.nn import dispatch
 from tensordict.utils import NestedKey
 from torch import Tensor
 from torch.distributions import Distribution
 
 from vusfa.objectives.functional import assert_same_shape
+from vusfa.objectives.goal_loss import GoalLoss, weighted_mean
 from vusfa.objectives.hindsight import walked_return
-from vusfa.objectives.network_loss import NetworkLoss, weighted_mean
 from vusfa.objectives.networks import entry, run_actor_critic, select_inputs
 
 __all__ = ["SearchKeys", "SearchLoss", "best_action_log_prob"]
@@ -61,7 +60,7 @@ class SearchKeys:
     value: NestedKey = "state_value"
 
 
-class SearchLoss(NetworkLoss):
+class SearchLoss(GoalLoss):
     r"""Value and policy of shortest paths that are known.
 
     .. math::
@@ -107,46 +106,13 @@ class SearchLoss(NetworkLoss):
     _AcceptedKeys = SearchKeys
     default_keys = SearchKeys
     tensor_keys: SearchKeys
-    _schedulable_buffers = frozenset({"critic_coeff", "objective_coeff"})
-
-    def __init__(
-        self,
-        actor_network: ProbabilisticTensorDictSequential,
-        critic_network: TensorDictModuleBase,
-        *,
-        critic_coeff: float | None = 1.0,
-        objective_coeff: float | None = 1.0,
-        gamma: float = 0.95,
-        goal_reward: float = 1.0,
-        step_reward: float = -0.01,
-        reduction: Literal["none", "mean", "sum"] | None = "mean",
-        functional: bool = True,
-    ) -> None:
-        if not 0 < gamma < 1:
-            raise ValueError(f"SearchLoss: gamma is {gamma}; give a number between 0 and 1")
-        super().__init__(
-            {"actor_network": actor_network, "critic_network": critic_network},
-            reduction=reduction,
-            functional=functional,
-        )
-        self._register_coefficients(critic_coeff=critic_coeff, objective_coeff=objective_coeff)
-        self.gamma, self.goal_reward, self.step_reward = gamma, goal_reward, step_reward
-
-    def check(self) -> None:
-        """Raise where the critic lacks an entry; ``forward`` does so, too."""
-        self._check_written("value")
+    terms = ("loss_search_critic", "loss_search_objective")
+    logged = ("search_accuracy",)
 
     def _default_in_keys(self) -> list[NestedKey]:
         keys = self.tensor_keys
         own: list[NestedKey] = [keys.best_action, keys.steps_to_goal]
         return [*own, *self.actor_network.in_keys, *self.critic_network.in_keys]
-
-    def _default_out_keys(self) -> list[NestedKey]:
-        present = {
-            "loss_search_critic": self.critic_coeff is not None,
-            "loss_search_objective": self.objective_coeff is not None,
-        }
-        return [*(key for key in present if present[key]), "search_accuracy"]
 
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -170,9 +136,7 @@ class SearchLoss(NetworkLoss):
         assert_same_shape("SearchLoss", steps_to_goal=steps, state_value=value)
         with torch.no_grad():
             target = walked_return(steps, self.gamma, self.goal_reward, self.step_reward)
-            counts = (steps > 0) & best.any(-1)
-            valid = self._valid(tensordict, counts)
-            counts = (counts if valid is None else counts & valid).to(value.dtype)
+            counts = self._counted(tensordict, (steps > 0) & best.any(-1)).to(value.dtype)
             hit = best.gather(-1, logits.argmax(-1, keepdim=True)).squeeze(-1).to(value.dtype)
         out = TensorDict({}, batch_size=[])
         if self.critic_coeff is not None:
