@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
@@ -78,9 +77,7 @@ class Hindsight(USF):
         """On-policy terms, and those of a sample that may hold the batch."""
         terms = super().losses(batch)
         self.replay.extend(batch)
-        # converted weights are not shared with the on-policy terms: gradients would be added in bfloat16
-        torch.clear_autocast_cache()
-        return {**terms, **self.replay_losses()}
+        return self._with_replay(terms)
 
     def replay_losses(self) -> dict[str, Tensor]:
         """Terms of a sample."""

@@ -6,7 +6,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
@@ -94,18 +93,12 @@ class ReplaySearch(USF):
             )
         self._searches = False
         self.graph = ExperienceGraph(scenes.num_states, scenes.num_actions)
-        actor, critic = agent.get_policy_operator(), agent.get_value_operator()
         rewards = {name: settings["env"][name] for name in ("goal_reward", "step_reward")}
-        coefficients = {name: numbers[name] for name in ("critic_coeff", "objective_coeff")}
+        options = {name: numbers[name] for name in ("critic_coeff", "objective_coeff")} | rewards
+        options["gamma"] = settings["objective"]["gamma"]
+        networks = agent.get_policy_operator(), agent.get_value_operator()
         try:
-            self.search_loss = SearchLoss(
-                actor,
-                critic,
-                **coefficients,
-                **rewards,
-                gamma=settings["objective"]["gamma"],
-                functional=False,
-            )
+            self.search_loss = SearchLoss(*networks, **options, functional=False)
         except ValueError as error:
             raise ConfigError(f"replay_search: {error}") from error
         self.search_loss.to(next(agent.parameters()).device)
@@ -124,11 +117,7 @@ class ReplaySearch(USF):
         """On-policy terms, and those of pairs from a graph that has the batch."""
         terms = super().losses(batch)
         self.graph.extend(batch)
-        if not self._searches:
-            return terms
-        # converted weights are not shared with the on-policy terms: gradients would be added in bfloat16
-        torch.clear_autocast_cache()
-        return {**terms, **self.replay_losses()}
+        return self._with_replay(terms) if self._searches else terms
 
     def replay_losses(self) -> dict[str, Tensor]:
         """Terms of a sample of pairs."""

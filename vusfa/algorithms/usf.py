@@ -103,6 +103,12 @@ class USF(Algorithm):
             result.update(term(batch).items())
         return result
 
+    def _with_replay(self, terms: dict[str, Tensor]) -> dict[str, Tensor]:
+        """Terms of a batch, and those of a sample of which the same optimizer step learns."""
+        # converted weights are not shared between the two: their gradients would be added in bfloat16
+        torch.clear_autocast_cache()
+        return {**terms, **self.replay_losses()}
+
     def after_step(self) -> None:
         """A step of the multiplier."""
         if self.multiplier is not None:
