@@ -110,9 +110,9 @@ def draw_goals(scenes: SceneSet, goals: Tensor, per_scene: int, generator: torch
     >>> draw_goals(rooms, torch.tensor([3, 5, 7, 300]), 2, generator).shape
     torch.Size([3])
     """
-    chosen = []
+    chosen, scene = [], scenes.scene_id.cpu()[goals]
     for index in range(scenes.num_scenes):
-        here = goals[scenes.scene_id.cpu()[goals] == index]
+        here = goals[scene == index]
         chosen.append(here[torch.randperm(len(here), generator=generator)[:per_scene]])
     return torch.cat(chosen)
 

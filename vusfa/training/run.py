@@ -85,9 +85,11 @@ def _run(
                 ended = converged()
         is_best = False
         if ended or before // log_every < trainer.frames // log_every:
-            with trainer.whole():
-                validated = {} if validate is None else dict(validate(ended))
-            metrics = trainer.metrics() | validated
+            validated: Mapping[str, float] = {}
+            if validate is not None:
+                with trainer.whole():
+                    validated = validate(ended)
+            metrics = trainer.metrics() | dict(validated)
             loggers.log_metrics(metrics, trainer.frames)
             progress.rates(metrics, validated=validate is not None)
             is_best = metrics.get(SCORE, math.nan) > trainer.validation["best"]
