@@ -13,9 +13,10 @@ from vusfa.cli.sources import Force, check_target
 if TYPE_CHECKING:
     from vusfa.deploy import Navigator
 
-__all__ = ["register"]
+__all__ = ["AGENT", "register"]
 
-_AGENT = typer.Argument(
+#: The argument of commands that take an agent.
+AGENT = typer.Argument(
     help="Checkpoint or folder of vusfa train, or a name of vusfa pretrained list.",
     metavar="CHECKPOINT",
     show_default=False,
@@ -45,7 +46,7 @@ def _load(
 
 
 def run(
-    agent: Annotated[str, _AGENT],
+    agent: Annotated[str, AGENT],
     goal: Annotated[Path, typer.Option(help="Picture taken at the goal.", show_default=False)],
     camera: Annotated[
         str,
@@ -119,7 +120,7 @@ def run(
 
 
 def export(
-    agent: Annotated[str, _AGENT],
+    agent: Annotated[str, AGENT],
     target: Annotated[Path, typer.Argument(help="ONNX file to write.", show_default=False)],
     scene: Annotated[str | None, typer.Option(help="Room of the walk that is compared.")] = None,
     threshold: Annotated[

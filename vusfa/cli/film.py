@@ -7,6 +7,8 @@ from typing import Annotated
 
 import typer
 
+from vusfa.cli.deploy import AGENT
+
 __all__ = ["register"]
 
 
@@ -16,14 +18,7 @@ def register(app: typer.Typer) -> None:
 
 
 def film(
-    agent: Annotated[
-        str,
-        typer.Argument(
-            help="Checkpoint or folder of a run, or a name of vusfa pretrained list.",
-            metavar="CHECKPOINT",
-            show_default=False,
-        ),
-    ],
+    agent: Annotated[str, AGENT],
     out: Annotated[Path, typer.Option(help="GIF to write; replaced if it exists.")] = Path("walk.gif"),
     scene: Annotated[str | None, typer.Option(help="Name of the room; by default the agent's first.")] = None,
     goal: Annotated[

@@ -12,8 +12,6 @@ from vusfa.errors import ConfigError, SceneError
 
 __all__ = ["Force", "check_target", "say_next", "scene_path", "scene_paths", "scenes_in"]
 
-_ENDINGS = (".h5", ".hdf5")
-
 #: The option of commands that write a file.
 Force = Annotated[bool, typer.Option("--force", help="Replace the file if it exists.")]
 
@@ -70,12 +68,14 @@ def scene_paths(sources: Sequence[str]) -> list[Path]:
     Raises:
         SceneError: a name is unknown, or a folder has no scene files.
     """
+    from vusfa.scenes.places import SUFFIXES
+
     found: dict[Path, None] = {}
     for source in sources:
         if Path(source).is_dir():
             inside = scenes_in(Path(source))
             if not inside:
-                raise SceneError(f"{source}: has no scene files in it; they end in {' or '.join(_ENDINGS)}")
+                raise SceneError(f"{source}: has no scene files in it; they end in {' or '.join(SUFFIXES)}")
             found.update(dict.fromkeys(inside))
         else:
             found[scene_path(source)] = None
@@ -85,10 +85,11 @@ def scene_paths(sources: Sequence[str]) -> list[Path]:
 def scenes_in(folder: Path) -> list[Path]:
     """Files of a folder that may be scenes; HDF5 files without a graph are skipped."""
     from vusfa.scenes.hdf5 import opened
+    from vusfa.scenes.places import SUFFIXES
 
     found = []
     for path in sorted(folder.iterdir()):
-        if path.suffix not in _ENDINGS or not path.is_file() or path.name.startswith("."):
+        if path.suffix not in SUFFIXES or not path.is_file() or path.name.startswith("."):
             continue
         try:
             with opened(path) as file:

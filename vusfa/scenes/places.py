@@ -14,9 +14,10 @@ from vusfa.errors import SceneError
 from vusfa.limits import MAX_FAULTS
 from vusfa.scenes.scene import Scene
 
-__all__ = ["expanded", "listed", "open_scenes"]
+__all__ = ["SUFFIXES", "expanded", "listed", "open_scenes"]
 
-_SUFFIXES = (".h5", ".hdf5")
+#: Endings of scene files.
+SUFFIXES = (".h5", ".hdf5")
 
 
 def expanded(scenes: str | os.PathLike[str] | Sequence[str | os.PathLike[str]]) -> list[Any]:
@@ -33,13 +34,13 @@ def expanded(scenes: str | os.PathLike[str] | Sequence[str | os.PathLike[str]]) 
     for source in listed(scenes):
         text = os.fspath(source)
         if os.path.isdir(text):
-            inside = sorted(entry.path for entry in os.scandir(text) if Path(entry.name).suffix in _SUFFIXES)
+            inside = sorted(entry.path for entry in os.scandir(text) if Path(entry.name).suffix in SUFFIXES)
         elif any(sign in text for sign in "*?[") and not os.path.lexists(text):
             inside = sorted(glob(text, recursive=True))
         else:
             inside = [source]
         if not inside:
-            raise SceneError(f"{text}: there are no scene files ({', '.join(_SUFFIXES)}); check the path")
+            raise SceneError(f"{text}: there are no scene files ({', '.join(SUFFIXES)}); check the path")
         found += inside
     return found
 
