@@ -32,6 +32,7 @@ from torch import Tensor, nn
 
 from vusfa.errors import ConfigError
 from vusfa.sources.crops import Preprocessing
+from vusfa.sources.layers import Features, Patches, UpTo
 from vusfa.sources.row_log import file_sha256
 from vusfa.sources.transformers_folder import PATCHES, POOLED, is_transformers_folder, open_folder
 
@@ -99,28 +100,6 @@ class Backbone:
             )
         found = found.float()
         return (found.mean((2, 3)) if found.ndim == 4 else found).cpu()
-
-
-class _UpTo(nn.Module):
-    """A network that answers with the output of one of its layers."""
-
-    def __init__(self, network: nn.Module, layer: str) -> None:
-        super().__init__()
-        self.network = network
-        self.found: Any = None
-        try:
-            network.get_submodule(layer).register_forward_hook(self._keep)
-        except AttributeError as error:
-            names = ", ".join(name for name, _ in network.named_children())
-            raise ConfigError(f"the network has no layer {layer!r}; at the top it has {names}") from error
-
-    def _keep(self, module: nn.Module, inputs: Any, output: Any) -> None:
-        self.found = output
-
-    def forward(self, images: Tensor) -> Any:
-        self.network(images)
-        found, self.found = self.found, None
-        return found
 
 
 def load_backbone(
@@ -233,18 +212,7 @@ def _lite0(path: Path | None) -> Backbone:
     network = package.EfficientNet.from_name(DEFAULT)
     _load_weights(network, path, DEFAULT)
     digest = file_sha256(path)
-    return Backbone(DEFAULT, "pooled features", digest, _LITE0, _Features(network), weights_from=origin)
-
-
-class _Features(nn.Module):
-    """EfficientNet-lite without its classifier."""
-
-    def __init__(self, network: nn.Module) -> None:
-        super().__init__()
-        self.network = network
-
-    def forward(self, images: Tensor) -> Tensor:
-        return self.network.extract_features(images)  # type: ignore[operator]
+    return Backbone(DEFAULT, "pooled features", digest, _LITE0, Features(network), weights_from=origin)
 
 
 def _torchvision(model: str, weights: Path, layer: str | None) -> Backbone:
@@ -259,7 +227,7 @@ def _torchvision(model: str, weights: Path, layer: str | None) -> Backbone:
         children = ", ".join(child for child, _ in network.named_children())
         raise ConfigError(f"{name}: has no pooled layer 'avgpool'; name a layer, at the top are {children}")
     layer = layer or "avgpool"
-    return Backbone(name, layer, file_sha256(weights), Preprocessing(crops="centre"), _UpTo(network, layer))
+    return Backbone(name, layer, file_sha256(weights), Preprocessing(crops="centre"), UpTo(network, layer))
 
 
 def _timm(model: str, weights: Path, layer: str | None) -> Backbone:
@@ -284,24 +252,10 @@ def _timm(model: str, weights: Path, layer: str | None) -> Backbone:
         network.reset_classifier(0)  # what is left answers with the pooled features
         layer = None
     elif layer == PATCHES:
-        network = _Patches(network)
+        network = Patches(network)
     else:
-        network = _UpTo(network, layer)
+        network = UpTo(network, layer)
     return Backbone(name, layer or "pooled features", file_sha256(weights), preprocessing, network)
-
-
-class _Patches(nn.Module):
-    """The patch tokens of a network of timm, as a map."""
-
-    def __init__(self, network: nn.Module) -> None:
-        super().__init__()
-        self.network = network
-
-    def forward(self, images: Tensor) -> Tensor:
-        found = self.network.forward_features(images)  # type: ignore[operator]
-        if found.ndim == 3:  # tokens, the class and the registers first
-            found = found[:, self.network.num_prefix_tokens :].transpose(1, 2).unsqueeze(3)
-        return found
 
 
 def _torchscript(path: Path) -> Backbone:
