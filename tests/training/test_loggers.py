@@ -277,6 +277,7 @@ def test_wandb_disabled_does_nothing(tmp_path: Path):
     log.log_metrics({"success": 0.5}, 10)
     log.log_media(media(), 10)
     log.close()
+    assert not list(tmp_path.rglob("*.wandb"))
 
 
 def test_a_sweeps_run_has_the_id_of_its_agent(monkeypatch: pytest.MonkeyPatch):
