@@ -72,10 +72,8 @@ class ExperienceGraph:
     def extend(self, batch: TensorDictBase) -> None:
         """Add a collector's batch of any shape: ``state_id``, ``action``, ``scene_id``, and the next
         ``state_id``."""
-        state, following = (
-            batch.get("state_id")[..., -1].cpu(),
-            batch.get(("next", "state_id"))[..., -1].cpu(),
-        )
+        state = batch.get("state_id")[..., -1].cpu()
+        following = batch.get(("next", "state_id"))[..., -1].cpu()
         action, scene = batch.get("action").cpu(), batch.get("scene_id").cpu()
         new = self.successor[state, action] != following
         if not new.any():

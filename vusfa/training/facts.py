@@ -40,7 +40,9 @@ def versions() -> dict[str, str]:
     >>> list(versions())
     ['vusfa', 'torch', 'torchrl', 'tensordict']
     """
-    return {name: version(name) for name in ("vusfa", "torch", "torchrl", "tensordict")}
+    # torch's builds for GPUs have "+cu130" in their own version, and not in that of their package
+    found = {name: version(name) for name in ("vusfa", "torch", "torchrl", "tensordict")}
+    return found | {"torch": str(torch.__version__)}
 
 
 def run_facts(state: Mapping[str, Any], overrides: Sequence[str] = ()) -> dict[str, Any]:
