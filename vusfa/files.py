@@ -17,6 +17,8 @@ from multiprocessing.util import Finalize
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from vusfa.errors import ConfigError, ResultError, printable
 
 __all__ = [
@@ -29,6 +31,7 @@ __all__ = [
     "use_own_temporary_folder",
     "write_csv",
     "write_json",
+    "write_npz",
     "write_text",
 ]
 
@@ -202,6 +205,13 @@ def write_json(path: str | Path, content: Any) -> Path:
     """Write indented JSON, atomically; NaN, which JSON does not have, becomes null."""
     text = json.dumps(_without_nan(content), indent=2, ensure_ascii=False, allow_nan=False)
     return write_text(path, text + "\n")
+
+
+def write_npz(path: str | Path, arrays: Mapping[str, np.ndarray]) -> Path:
+    """Write arrays as a compressed .npz file, atomically."""
+    with replacing(path) as unfinished, open(unfinished, "wb") as file:
+        np.savez_compressed(file, allow_pickle=False, **arrays)
+    return Path(path)
 
 
 def write_text(path: str | Path, text: str) -> Path:

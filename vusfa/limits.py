@@ -7,9 +7,11 @@ beyond the size of its input. They are far above every file that is known.
 from __future__ import annotations
 
 import reprlib
+from collections.abc import Iterable
+from itertools import islice
 from typing import Any
 
-__all__ = ["brief"]
+__all__ = ["brief", "listing"]
 
 # ---- scenes (HDF5)
 
@@ -20,6 +22,8 @@ MAX_STATES = 100_000
 TABLE_STATES, MAX_DISTANCE_STATES = 4096, 16_384
 #: Size of the shortest paths that a scene without a table keeps.
 MAX_PATH_BYTES = 1 << 26
+#: Scene files from which on a set is opened lazily; size of the features or pictures that are then kept.
+LAZY_SCENES, RESIDENT_BYTES = 100, 1 << 28
 #: Size of a dataset over its size in the file. Tables of distances have about 10.
 MAX_COMPRESSION = 200
 #: The same for raw pictures, which are read some at a time: what gzip reaches with a single color.
@@ -107,3 +111,13 @@ def brief(value: Any) -> str:
     '[0, 1, 2, 3, 4, 5, 6, 7, 8, 9, ...]'
     """
     return _BRIEF.repr(value)
+
+
+def listing(names: Iterable[str], most: int = 20) -> str:
+    """Names, as messages list them: the first so many.
+
+    >>> listing(["bathroom", "kitchen"]), listing(map(str, range(10_000)), most=3)
+    ('bathroom, kitchen', '0, 1, 2, ...')
+    """
+    first = list(islice(names, most + 1))
+    return ", ".join([*first[:most], *(["..."] if len(first) > most else [])])

@@ -17,6 +17,7 @@ from vusfa.deploy.backbone import find_backbone
 from vusfa.deploy.pictures import as_picture, in_shape
 from vusfa.deploy.places import Places
 from vusfa.errors import ConfigError, GoalError
+from vusfa.limits import listing
 from vusfa.modules import Agent
 from vusfa.scenes import SceneSet
 from vusfa.sources.backbones import Backbone
@@ -163,7 +164,7 @@ class Navigator:
         assert self.scene is not None
         found = float(similar[self.scenes.scene_index(self.scene)])
         if found < self.places.known and not self.agent.config["shared_heads"]:
-            where = f"room {self.scene!r}" if self._named else f"the rooms {', '.join(self.scenes.names)}"
+            where = f"room {self.scene!r}" if self._named else f"the rooms {listing(self.scenes.names)}"
             raise GoalError(
                 f"{name}: was not taken in {where} (similarity {found:.2f} to the nearest state, at least"
                 f" {self.places.known:.2f} is needed); take the goal's picture in a room of the agent"

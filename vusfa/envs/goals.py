@@ -26,7 +26,7 @@ import torch
 from torch import Tensor
 
 from vusfa.errors import GoalError
-from vusfa.limits import TABLE_STATES, brief
+from vusfa.limits import TABLE_STATES, brief, listing
 from vusfa.reading import read_yaml
 from vusfa.scenes import Scene, SceneSet
 from vusfa.scenes.graph import shortest_path_distances, strong_components
@@ -180,7 +180,7 @@ def _as_tensor(goals: Any, source: str) -> Tensor:
 def _by_scene(scenes: SceneSet, goals: Mapping[str, Any], source: str) -> Tensor:
     unknown = [name for name in goals if name not in scenes.names]
     if unknown:
-        raise GoalError(f"{source} name the scene {unknown[0]!r}; this set has {', '.join(scenes.names)}")
+        raise GoalError(f"{source} name the scene {unknown[0]!r}; this set has {listing(scenes.names)}")
     found = []
     for scene, first in _scenes_and_offsets(scenes):
         entry = goals.get(scene.name, [])

@@ -17,7 +17,8 @@ from torchrl.envs import ObservationTransform, TransformedEnv
 
 from vusfa.envs.navigation import TargetNavEnv
 from vusfa.errors import ConfigError, SceneError
-from vusfa.scenes import SceneSet
+from vusfa.scenes import Scene, SceneSet
+from vusfa.scenes.features import SceneRows
 
 __all__ = ["SceneObservation", "observation_table"]
 
@@ -39,19 +40,25 @@ def observation_table(scenes: SceneSet, kind: str, size: tuple[int, int] | None 
     (torch.Size([176, 1, 1280]), torch.Size([176, 1, 3, 24, 32]))
     """
     if kind == "features":
-        return scenes.features
+        return scenes.features[:] if scenes.is_lazy else scenes.features
     if kind != "pixels":
         raise ConfigError(f"kind is {kind!r}; it is 'features' or 'pixels'")
+    _check_sizes(scenes, size)
+    return torch.cat([_pixels(scene, size) for scene in scenes.scenes]).unsqueeze(1)
+
+
+def _check_sizes(scenes: SceneSet, size: tuple[int, int] | None) -> None:
     shapes = {scene.picture_shape for scene in scenes.scenes}
     if size is None and None not in shapes and len(shapes) > 1:
         raise SceneError(f"the scenes' pictures differ in size ({shapes}); pass size=(height, width)")
-    parts = []
-    for scene in scenes.scenes:
-        pixels = scene.pictures(torch.arange(scene.num_states)).permute(0, 3, 1, 2)
-        if size is not None and tuple(pixels.shape[-2:]) != tuple(size):
-            pixels = interpolate(pixels, size=tuple(size), mode="bilinear", antialias=True)
-        parts.append(pixels.contiguous())
-    return torch.cat(parts).unsqueeze(1)
+
+
+def _pixels(scene: Scene, size: tuple[int, int] | None) -> Tensor:
+    """Pictures (N, 3, h, w) of a scene."""
+    pixels = scene.pictures(torch.arange(scene.num_states)).permute(0, 3, 1, 2)
+    if size is not None and tuple(pixels.shape[-2:]) != tuple(size):
+        pixels = interpolate(pixels, size=tuple(size), mode="bilinear", antialias=True)
+    return pixels.contiguous()
 
 
 class SceneObservation(ObservationTransform):
@@ -117,8 +124,16 @@ class SceneObservation(ObservationTransform):
         self.crops = crops
         # Not a buffer: it is built when it is needed, and neither saved nor pickled.
         self._table: Tensor | None = None
+        self._rows = SceneRows(scenes.offsets) if scenes.is_lazy else None
+        if kind == "pixels" and scenes.is_lazy:
+            _check_sizes(scenes, size)
 
     def _apply_transform(self, obs: Tensor) -> Tensor:
+        if self._rows is not None:
+            found = self._rows(obs.reshape(-1), self._read)  # (n, C, ...)
+            crop: Tensor | int = 0 if self.crop is not None else self._drawn(obs)
+            found = found[torch.arange(len(found), device=found.device), crop]
+            return found.reshape(*obs.shape, *found.shape[1:])
         table = self._table
         if table is None or table.device != obs.device:
             table = observation_table(self.scenes, self.kind, self.size).to(obs.device)
@@ -127,10 +142,21 @@ class SceneObservation(ObservationTransform):
             self._table = table
         entry = obs.reshape(-1)
         if self.crop is None:
-            drawn = torch.randint(self.crops, entry.shape, generator=self._generator(), device=obs.device)
-            entry = entry * self.crops + drawn
+            entry = entry * self.crops + self._drawn(obs)
         found = table.flatten(0, 1).index_select(0, entry)
         return found.reshape(*obs.shape, *found.shape[1:])
+
+    def _read(self, scene: int) -> Tensor:
+        """Observations (N, C, ...) of a scene; C is 1 where the crop is given."""
+        if self.kind == "pixels":
+            return _pixels(self.scenes.scenes[scene], self.size).unsqueeze(1)
+        crops = slice(None) if self.crop is None else slice(self.crop, self.crop + 1)
+        return self.scenes.features.of_scene(scene)[:, crops]
+
+    def _drawn(self, obs: Tensor) -> Tensor:
+        """A crop (n,) for each entry."""
+        shape = (obs.numel(),)
+        return torch.randint(self.crops, shape, generator=self._generator(), device=obs.device)
 
     def _generator(self) -> torch.Generator | None:
         env: Any = self.container

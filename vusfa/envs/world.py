@@ -71,6 +71,9 @@ class RotatingWorld:
         if turn == self.turn:
             return None
         self.turn = turn
+        if self.scenes.is_lazy:
+            active, coming = (set(self.rotation.scenes_at(time)) for time in (turn, turn + 1))
+            self.scenes.features.prefetch(coming - active)
         rows = None if self.rows is None else self.rotation.rows_at(turn, self.rows)
         return make_world(self.scenes, self.rotation.goals_at(turn)[0], self.rewards, rows, self._starts)
 

@@ -123,9 +123,10 @@ def expected_walks(
     """
     probabilities = probabilities or uniform_probabilities(scenes.num_actions)
     parts, summed = [], torch.zeros(2, scenes.num_states, dtype=torch.float64)
-    for index, scene in enumerate(scenes.scenes):
-        first = int(scenes.offsets[index])
-        here = goals[scenes.scene_id.to(goals.device)[goals] == index] - first
+    scene_of = scenes.scene_id.to(goals.device)[goals]
+    for index in scene_of.unique().tolist():
+        scene, first = scenes.scenes[index], int(scenes.offsets[index])
+        here = goals[scene_of == index] - first
         for block, chance, shortest, arrival in _distributions(probabilities, scenes, index, here, max_steps):
             steps = torch.arange(chance.shape[1], dtype=torch.float64)[:, None]
             ways = torch.arange(chance.shape[2], dtype=torch.float64)

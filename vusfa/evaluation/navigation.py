@@ -7,8 +7,10 @@ batch per step.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
+from itertools import pairwise
 from typing import Any
 
 import torch
@@ -84,18 +86,13 @@ def evaluate(
             unreachable=unreachable,
             generator=generator,
         )
+    limits: dict[str, Any] = {"max_steps": max_steps, "history": history, "batch_size": batch_size}
     with acting(policy, scenes, sample, seed):
-        success, length, collisions, end = walk(
-            policy,
-            scenes,
-            start,
-            goal,
-            max_steps=max_steps,
-            history=history,
-            batch_size=batch_size,
-            observe=observe,
-            progress=progress,
-        )
+        if scenes.is_lazy:
+            walked = _walk_by_scene(policy, scenes, start, goal, progress, observe=observe, **limits)
+        else:
+            walked = walk(policy, scenes, start, goal, observe=observe, progress=progress, **limits)
+    success, length, collisions, end = walked
     marked = torch.zeros(scenes.num_states, dtype=torch.bool)
     if trained is not None:
         marked[trained.cpu()] = True
@@ -112,6 +109,37 @@ def evaluate(
         max_steps=max_steps,
         remaining=scenes.distance(end, goal).cpu(),
     )
+
+
+def _walk_by_scene(
+    policy: TensorDictModuleBase,
+    scenes: SceneSet,
+    start: Tensor,
+    goal: Tensor,
+    progress: Progress | None,
+    *,
+    batch_size: int,
+    **options: Any,
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """As :func:`walk`, in a few scenes at a time: at most ``batch_size`` episodes, or one scene. Of these
+    the policy's answers are computed once, and no others have their features in memory."""
+    scene = scenes.scene_id.cpu()[goal]
+    order, total = scene.argsort(stable=True), len(goal)
+    ends = scene.unique(return_counts=True)[1].cumsum(0).tolist()
+    parts, first = [], 0
+    for end, following in pairwise([*ends, math.inf]):
+        if following - first <= batch_size:
+            continue
+        rows = order[first:end]
+        done = None if progress is None else (lambda n, _, first=first: progress(first + n, total))
+        with caching(policy, scenes, goal[rows].unique()):
+            parts.append(
+                walk(policy, scenes, start[rows], goal[rows], progress=done, batch_size=batch_size, **options)
+            )
+        first = end
+    back = order.argsort()
+    success, length, collisions, last = (torch.cat(column)[back] for column in zip(*parts, strict=True))
+    return success, length, collisions, last
 
 
 @torch.no_grad()
@@ -237,6 +265,16 @@ def trails(
 
 
 @contextmanager
+def caching(policy: nn.Module, scenes: SceneSet | None = None, goals: Tensor | None = None) -> Iterator[None]:
+    """Context of :meth:`~vusfa.modules.InferencePolicy.cached` for every inference policy in a policy."""
+    with ExitStack() as stack:
+        for module in policy.modules():
+            if isinstance(module, InferencePolicy):
+                stack.enter_context(module.cached(goals, scenes))
+        yield
+
+
+@contextmanager
 def acting(policy: nn.Module, scenes: SceneSet, sample: bool = True, seed: int = 0) -> Iterator[None]:
     """Evaluation mode, cached inference policies and an own random state; all restored afterwards.
 
@@ -251,9 +289,8 @@ def acting(policy: nn.Module, scenes: SceneSet, sample: bool = True, seed: int =
     exploration = ExplorationType.RANDOM if sample else ExplorationType.DETERMINISTIC
     try:
         with torch.random.fork_rng(devices), set_exploration_type(exploration), ExitStack() as stack:
-            for module in policy.modules():
-                if isinstance(module, InferencePolicy):
-                    stack.enter_context(module.cached())
+            if not scenes.is_lazy:  # else of a few scenes at a time
+                stack.enter_context(caching(policy))
             torch.manual_seed(seed)
             yield
     finally:

@@ -17,7 +17,7 @@ from torch import Tensor
 from vusfa.envs.goals import resolve_goals
 from vusfa.errors import ResultError
 from vusfa.evaluation.starts import episode_starts
-from vusfa.files import replacing
+from vusfa.files import write_npz
 from vusfa.reading import read_npz
 from vusfa.scenes import SceneSet
 
@@ -120,17 +120,8 @@ def draw_goals(scenes: SceneSet, goals: Tensor, per_scene: int, generator: torch
 def write_manifest(path: str | Path, manifest: Manifest) -> Path:
     """Write a manifest (.npz), atomically; ids as 32-bit integers."""
     columns = {name: getattr(manifest, name).numpy().astype(np.int32) for name in ("start", "goal")}
-    with replacing(path) as unfinished, open(unfinished, "wb") as file:
-        np.savez_compressed(
-            file,
-            allow_pickle=False,
-            start=columns["start"],
-            goal=columns["goal"],
-            validation=manifest.validation.numpy(),
-            seed=np.int64(manifest.seed),
-            fingerprint=np.array(manifest.fingerprint),
-        )
-    return Path(path)
+    others = {"seed": np.int64(manifest.seed), "fingerprint": np.array(manifest.fingerprint)}
+    return write_npz(path, {**columns, "validation": manifest.validation.numpy(), **others})
 
 
 def read_manifest(path: str | Path = BUNDLED_MANIFEST) -> Manifest:

@@ -11,7 +11,7 @@ import torch
 from tensordict.nn import TensorDictModuleBase
 
 from vusfa.evaluation import Episodes, evaluate
-from vusfa.evaluation.exact import ExpectedWalks, exact_goals, expected_walks, sampled_walks
+from vusfa.evaluation.exact import ExpectedWalks, Probabilities, exact_goals, expected_walks, sampled_walks
 from vusfa.evaluation.metrics import get_metric
 from vusfa.evaluation.navigation import acting
 from vusfa.experiments.manifest import BUNDLED_MANIFEST, Manifest, make_manifest, read_manifest
@@ -71,7 +71,8 @@ def evaluation_policy(agent: Agent, scenes: SceneSet | None = None) -> TensorDic
 
     Args:
         agent: with its present weights.
-        scenes: given where every state will be a goal; a one-frame agent then becomes a table.
+        scenes: given where every state will be a goal; a one-frame agent then becomes a table, unless the
+            scenes are opened lazily, and so evaluated one after the other.
 
     >>> from vusfa.modules import TabularPolicy, make_agent
     >>> rooms = SceneSet.bundled(["bathroom"])
@@ -79,7 +80,7 @@ def evaluation_policy(agent: Agent, scenes: SceneSet | None = None) -> TensorDic
     >>> type(evaluation_policy(agent)).__name__, type(evaluation_policy(agent, rooms)).__name__
     ('InferencePolicy', 'TabularPolicy')
     """
-    if scenes is not None and agent.is_tabular:
+    if scenes is not None and agent.is_tabular and not scenes.is_lazy:
         return TabularPolicy(agent, scenes)
     return InferencePolicy(agent)
 
@@ -119,7 +120,11 @@ def measure_checkpoint(
             )
             for mode in MODES
         }
-    exact = exact_goals(policy.probabilities, scenes) if isinstance(policy, TabularPolicy) else None
+    exact = None
+    if isinstance(policy, TabularPolicy):
+        exact = exact_goals(policy.probabilities, scenes)
+    elif agent.is_tabular:
+        exact = exact_goals(probabilities_by_scene(agent, scenes), scenes)
     info = {**run_facts(state, overrides), "checkpoint": checkpoint.name}
     return Run(experiment, name, info, tables, exact)
 
@@ -140,6 +145,8 @@ def measure_goals(
     scenes = trainer.scenes.to(device)
     if agent.is_tabular:
         with acting(agent, scenes):
+            if scenes.is_lazy:
+                return expected_walks(probabilities_by_scene(agent, scenes, goals), scenes, goals, max_steps)
             table = TabularPolicy(agent, scenes, goals)
         return expected_walks(
             lambda *ids: table.probabilities(*(each.to(device) for each in ids)).cpu(),
@@ -158,6 +165,30 @@ def measure_goals(
             observe=trainer.observation,
         )
     return sampled_walks(episodes, scenes, goals)
+
+
+def probabilities_by_scene(
+    agent: Agent, scenes: SceneSet, goals: torch.Tensor | None = None
+) -> Probabilities:
+    """Probabilities of a one-frame agent's actions, of which the table of one scene at a time is kept.
+
+    Args:
+        agent: as it is now.
+        scenes: on its device.
+        goals: (G,) global ids of the only goals to come; None for all states.
+    """
+    every = torch.arange(scenes.num_states) if goals is None else goals.cpu()
+    scene_of, latest = scenes.scene_id.cpu()[every], {}
+
+    def probabilities(state: torch.Tensor, goal: torch.Tensor, scene: torch.Tensor) -> torch.Tensor:
+        index = int(scene[0])
+        if index not in latest:
+            latest.clear()
+            latest[index] = TabularPolicy(agent, scenes, every[scene_of == index])
+        ids = (each.to(scenes.device) for each in (state, goal, scene))
+        return latest[index].probabilities(*ids).cpu()
+
+    return probabilities
 
 
 def walk_manifest(

@@ -25,6 +25,7 @@ from vusfa.experiments.measure import measure_goals
 from vusfa.files import say
 from vusfa.training import Trainer
 from vusfa.training.loggers import Logger
+from vusfa.training.metrics import MAX_SCENES, quantiles
 
 __all__ = ["Draw", "Validation"]
 
@@ -49,7 +50,8 @@ class Validation:
     Attributes:
         goals: (G,) global ids, scene by scene.
         subsets: which of them (G,) bool are "trained" goals and which "validation" goals. Where every state
-            is a trained goal, validation goals are drawn from these.
+            is a trained goal, validation goals are drawn from these. Of more than 100 scenes, 100 are
+            drawn, the same each time.
 
     >>> from vusfa.experiments.training import compose_settings
     >>> from vusfa.training import make_loggers, make_trainer
@@ -63,14 +65,19 @@ class Validation:
 
     def __init__(self, trainer: Trainer, loggers: Logger, draw: Draw | None = None) -> None:
         self._trainer, self._loggers, self._draw = trainer, loggers, draw
-        chosen, scenes = trainer.settings["evaluation"], trainer.scenes
-        self.interval = chosen.get("interval", "auto")
-        self.max_steps = chosen["max_steps"] or MAX_STEPS
+        settings, scenes = trainer.settings["evaluation"], trainer.scenes
+        self.interval = settings.get("interval", "auto")
+        self.max_steps = settings["max_steps"] or MAX_STEPS
         self._scene = scenes.scene_id.cpu()
-        every, trained, draws = resolve_goals(scenes, "all"), trainer.goals.cpu(), torch.Generator()
+        every, trained, draws = resolve_goals(scenes, "all"), trainer.goals.cpu().unique(), torch.Generator()
+        self._many = scenes.num_scenes > MAX_SCENES
+        if self._many:
+            chosen = torch.randperm(scenes.num_scenes, generator=draws.manual_seed(0))[:MAX_SCENES]
+            every, trained = (ids[torch.isin(self._scene[ids], chosen)] for ids in (every, trained))
+            trained = trained if len(trained) else every
         unseen = every[~torch.isin(every, trained)]
         unseen = draw_goals(scenes, unseen if len(unseen) else every, VALIDATION_GOALS, draws.manual_seed(0))
-        trained = draw_goals(scenes, trained.unique(), TRAINED_GOALS, draws)
+        trained = draw_goals(scenes, trained, TRAINED_GOALS, draws)
         self.goals = torch.cat([trained, unseen]).unique()
         subsets = {"trained": trained, "validation": unseen}
         self.subsets = {name: torch.isin(self.goals, ids) for name, ids in subsets.items()}
@@ -154,6 +161,10 @@ class Validation:
             for name in ("success", "spl"):
                 column = getattr(walks, name)
                 metrics[f"eval/{subset}/{name}"] = column[chosen].nanmean().item()
+                if self._many:
+                    means = [column[chosen & (scene == index)].nanmean() for index in scene.unique()]
+                    metrics |= quantiles(f"scenes/eval/{subset}/{name}", torch.stack(means))
+                    continue
                 for index, place in enumerate(self._trainer.scenes.names):
                     here = column[chosen & (scene == index)]
                     metrics[f"scene/{place}/eval/{subset}/{name}"] = here.nanmean().item()

@@ -7,6 +7,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from vusfa.errors import ConfigError
+from vusfa.limits import RESIDENT_BYTES
 from vusfa.modules.agents import Agent
 
 __all__ = ["explained_features", "pretrain_autoencoder"]
@@ -44,7 +45,8 @@ def pretrain_autoencoder(
         the share of the features' variance that the reconstruction explains, see :func:`explained_features`.
 
     Raises:
-        ConfigError: the agent was not made with ``pretrained="autoencoder"``.
+        ConfigError: the agent was not made with ``pretrained="autoencoder"``, or in lazily opened scenes of
+            more features than these keep.
 
     >>> from vusfa.modules import make_agent
     >>> from vusfa.scenes import SceneSet
@@ -57,6 +59,12 @@ def pretrain_autoencoder(
     if agent.config["pretrained"] != "autoencoder":
         raise ConfigError("only an agent made with pretrained='autoencoder' has its encoder pretrained")
     encoder = agent.encoder
+    needed = 4 * encoder.frames.num_states * encoder.frames.size
+    if encoder.frames.is_lazy and needed > RESIDENT_BYTES:
+        raise ConfigError(
+            f"algorithm=autoencoder learns from the features of all states at once, {needed >> 20} MiB, of"
+            f" which lazily opened scenes keep {RESIDENT_BYTES >> 20}; give fewer scenes or another algorithm"
+        )
     features: Tensor = encoder.frames.lookup(None)
     generator = torch.Generator().manual_seed(seed)
     decoder = nn.Linear(agent.config["embedding_size"], features.shape[-1]).to(features.device)

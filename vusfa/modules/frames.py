@@ -12,6 +12,8 @@ from torch.nn import functional
 from vusfa.errors import ConfigError
 from vusfa.limits import brief
 from vusfa.modules.precision import for_autocast
+from vusfa.scenes import SceneSet
+from vusfa.scenes.features import LazyFeatures, SceneRows
 
 __all__ = ["FeatureFrames", "PictureFrames", "shrink_pictures"]
 
@@ -20,7 +22,8 @@ class FeatureFrames(nn.Module):
     """Precomputed features of frames: a table of all states, crop 0, that stays out of the ``state_dict``.
 
     Args:
-        features: (S, C, F) float32 of all states, as in ``SceneSet.features``.
+        features: (S, C, F) float32 of all states, as in ``SceneSet.features``. Of a lazily opened set the
+            rows that are asked for are read, normalized and kept (:class:`~vusfa.scenes.features.SceneRows`).
         lookup: keep the table; ``False`` for an agent that is handed features.
         normalize: bring every feature to mean 0 and deviation 1 over the S states. The 2 F numbers are
             part of the ``state_dict``, because the weights behind them mean nothing with others. A feature
@@ -40,16 +43,28 @@ class FeatureFrames(nn.Module):
     deviation: Tensor
     _converted: Tensor | None
 
-    def __init__(self, features: Tensor, lookup: bool = True, normalize: bool = False) -> None:
+    def __init__(self, features: Tensor | LazyFeatures, lookup: bool = True, normalize: bool = False) -> None:
         super().__init__()
-        table = features[:, 0].to(torch.get_default_dtype()).contiguous()
-        self.size = table.shape[-1]
+        self.size = features.shape[-1]
         self.normalize = normalize
+        self._features, self._rows = None, None
+        if isinstance(features, LazyFeatures):
+            table = torch.empty(0, self.size)
+            self._features, self._rows = features, SceneRows(features.offsets) if lookup else None
+        else:
+            table = features[:, 0].to(torch.get_default_dtype()).contiguous()
         self.register_buffer("table", table if lookup else table[:0].clone(), persistent=False)
         self.register_buffer("_converted", None, persistent=False)  # as autocast would
         if normalize:
-            self.register_buffer("mean", table.mean(0))
-            self.register_buffer("deviation", _deviation(table))
+            if self._features is None:
+                spread = table.std(0, correction=0), table.abs().amax(0)
+                self.register_buffer("mean", table.mean(0))
+            else:
+                _, mean, *spread = (
+                    part if isinstance(part, str) else part.to(table) for part in self._features.summary
+                )
+                self.register_buffer("mean", mean)
+            self.register_buffer("deviation", _deviation(*spread, len(features)))
             # Kept as the encoder wants it, and brought up to date when other numbers are loaded.
             self.table = (self.table - self.mean) / self.deviation
             self._register_load_state_dict_pre_hook(self._renormalize)
@@ -57,13 +72,20 @@ class FeatureFrames(nn.Module):
     @property
     def num_states(self) -> int:
         """S, or 0 without a table."""
-        return len(self.table)
+        return len(self.table) if self._rows is None else self._rows.num_states
+
+    @property
+    def is_lazy(self) -> bool:
+        """Whether rows are read when they are asked for."""
+        return self._rows is not None
 
     def lookup(self, ids: Tensor | None) -> Tensor:
         """Features (\\*B, F) of states (\\*B,) int64; of all S states in order for ``None``.
 
         Under autocast the table is converted once, because it is constant.
         """
+        if self._rows is not None:
+            return for_autocast(self._rows(_all_of(self, ids), self._read))
         table, device = self.table, self.table.device.type
         if torch.is_autocast_enabled(device):
             if self._converted is None or self._converted.dtype != torch.get_autocast_dtype(device):
@@ -71,9 +93,16 @@ class FeatureFrames(nn.Module):
             table = self._converted
         return table if ids is None else table[ids]
 
+    def _read(self, scene: int) -> Tensor:
+        """Features (N, F) of a scene as the encoder wants them."""
+        assert self._features is not None
+        return self.encode(self._features.of_scene(scene)[:, 0].to(self.table.device))
+
     def _apply(self, fn: Any, recurse: bool = True) -> Any:
-        """As every move of a module; what autocast converted is converted anew."""
+        """As every move of a module; what autocast converted is converted anew, what was read, read anew."""
         self._converted = None
+        if self._rows is not None:
+            self._rows.clear()
         return super()._apply(fn, recurse)
 
     def encode(self, observation: Tensor) -> Tensor:
@@ -91,6 +120,8 @@ class FeatureFrames(nn.Module):
         if not (torch.equal(mean, self.mean) and torch.equal(deviation, self.deviation)):
             self.table.copy_((self.table * self.deviation + self.mean - mean) / deviation)
             self._converted = None
+            if self._rows is not None:
+                self._rows.clear()
 
 
 class PictureFrames(nn.Module):
@@ -100,7 +131,8 @@ class PictureFrames(nn.Module):
     3 x 3 by 1, each with a ReLU, turn 60 x 80 pixels into 4 x 6 x 64 = 1536 features.
 
     Args:
-        pictures: (S, H, W, 3) uint8 of all states for an agent that looks them up, else ``None``.
+        pictures: (S, H, W, 3) uint8 of all states for an agent that looks them up, else ``None``. Of a
+            lazily opened ``SceneSet``, given in their place, pictures are read when they are asked for.
         picture_size: height and width that the convolutions see, pixels.
 
     Raises:
@@ -114,14 +146,17 @@ class PictureFrames(nn.Module):
     frame_dims = 3
     table: Tensor
 
-    def __init__(self, pictures: Tensor | None, picture_size: tuple[int, int] = (60, 80)) -> None:
+    def __init__(self, pictures: Tensor | SceneSet | None, picture_size: tuple[int, int] = (60, 80)) -> None:
         super().__init__()
         self.picture_size = (int(picture_size[0]), int(picture_size[1]))
         if min(self.picture_size) < 36:
             raise ConfigError(
                 f"picture_size is {self.picture_size}; the convolutions need at least 36 x 36 pixels"
             )
-        if pictures is None:
+        self._scenes, self._rows = None, None
+        if isinstance(pictures, SceneSet):
+            self._scenes, self._rows = pictures.scenes, SceneRows(pictures.offsets)
+        if not isinstance(pictures, Tensor):
             pictures = torch.empty(0, *self.picture_size, 3, dtype=torch.uint8)
         table = shrink_pictures(pictures.movedim(-1, -3), self.picture_size).contiguous()
         self.register_buffer("table", table, persistent=False)
@@ -140,10 +175,23 @@ class PictureFrames(nn.Module):
     @property
     def num_states(self) -> int:
         """S, or 0 without a table."""
-        return len(self.table)
+        return len(self.table) if self._rows is None else self._rows.num_states
+
+    @property
+    def is_lazy(self) -> bool:
+        """Whether pictures are read when they are asked for."""
+        return self._rows is not None
+
+    def _read(self, scene: int) -> Tensor:
+        """Pictures (N, 3, H, W) of a scene in the size that the convolutions see."""
+        assert self._scenes is not None
+        room = self._scenes[scene]
+        return shrink_pictures(room.pictures(range(room.num_states)).movedim(-1, -3), self.picture_size)
 
     def lookup(self, ids: Tensor | None) -> Tensor:
         """Features (\\*B, F) of states (\\*B,) int64; of all S states in order for ``None``."""
+        if self._rows is not None:
+            return self.encode(self._rows(_all_of(self, ids), self._read))
         return self.encode(self.table if ids is None else self.table[ids])
 
     def encode(self, observation: Tensor) -> Tensor:
@@ -155,14 +203,17 @@ class PictureFrames(nn.Module):
         return self.convolutions(pixels / 127.5 - 1).view(*batch, self.size)
 
 
-def _deviation(table: Tensor) -> Tensor:
-    """What each feature (F,) of a table (S, F) is divided by: its deviation over the states, and no less than
-    1e-3 or, of features of small scale, a hundredth of the usual deviation."""
-    deviation = table.std(0, correction=0)
-    constant = deviation <= 1e-6 * table.abs().amax(0)  # but for rounding
+def _all_of(frames: FeatureFrames | PictureFrames, ids: Tensor | None) -> Tensor:
+    return torch.arange(frames.num_states, device=frames.table.device) if ids is None else ids
+
+
+def _deviation(deviation: Tensor, largest: Tensor, num_states: int) -> Tensor:
+    """What each feature (F,) is divided by: its deviation over the states, and no less than 1e-3 or, of
+    features of small scale, a hundredth of the usual deviation; ``largest`` is its largest absolute value."""
+    constant = deviation <= 1e-6 * largest  # but for rounding
     if constant.all():
         raise ConfigError(
-            f"none of the {len(constant)} features changes over {len(table)} states; encode the scenes again"
+            f"none of the {len(constant)} features changes over {num_states} states; encode the scenes again"
         )
     floor = deviation[~constant].median().mul(0.01).clamp(max=1e-3)
     if constant.any():
@@ -191,6 +242,7 @@ def shrink_pictures(pictures: Tensor, size: tuple[int, int]) -> Tensor:
     return torch.cat(parts)
 
 
-def picture_table(scenes: Any) -> Tensor:
-    """All pictures (S, H, W, 3) uint8 of a ``SceneSet``; a SceneError where there are none of one size."""
-    return scenes.pictures(torch.arange(scenes.num_states))
+def picture_table(scenes: SceneSet) -> Tensor | SceneSet:
+    """All pictures (S, H, W, 3) uint8 of a set, or a lazily opened set itself; a SceneError where there are
+    none of one size."""
+    return scenes if scenes.is_lazy else scenes.pictures(torch.arange(scenes.num_states))

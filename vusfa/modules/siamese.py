@@ -227,7 +227,7 @@ class SiameseEncoder(nn.Module):
 
         With as many rows as the world has states: of all states, so that the id is the row.
         """
-        if len(goals) >= self.frames.num_states:
+        if len(goals) >= self.frames.num_states and not self.frames.is_lazy:
             return self.frames.lookup(None), states, goals
         unique = unique_rows(torch.cat([states.flatten(), goals]))
         (distinct,), index = unique.padded() if is_bucketed(self.branch.first.bias) else unique

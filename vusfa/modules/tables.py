@@ -14,7 +14,8 @@ PAIRS_PER_ROW = 3
 
 
 def states_around(scenes: SceneSet, goals: Tensor) -> Tensor | None:
-    """Ids (n,) of the states of the scenes of goals, ascending; None where they are half of all or more.
+    """Ids (n,) of the states of the scenes of goals, ascending; None where they are half of all or more, and
+    their features are in memory.
 
     >>> states_around(SceneSet.bundled(), torch.tensor([3, 9])).shape
     torch.Size([176])
@@ -22,7 +23,8 @@ def states_around(scenes: SceneSet, goals: Tensor) -> Tensor | None:
     scene = scenes.scene_id[goals.to(scenes.device)].unique()
     first, end = scenes.offsets[scene].tolist(), scenes.offsets[scene + 1].tolist()
     states = [torch.arange(*pair, device=scenes.device) for pair in zip(first, end, strict=True)]
-    return torch.cat(states) if 2 * sum(map(len, states)) < scenes.num_states else None
+    few = scenes.is_lazy or 2 * sum(map(len, states)) < scenes.num_states
+    return torch.cat(states) if few else None
 
 
 def table_pays(scenes: SceneSet, goals: Tensor | None, rows: int | None) -> bool:

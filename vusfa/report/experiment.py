@@ -17,6 +17,7 @@ from vusfa.evaluation.exact import ExactGoals, exact_goals, uniform_probabilitie
 from vusfa.evaluation.long_table import distance_to_trained, episode_rows, exact_rows, join_tables
 from vusfa.evaluation.statistics import Sums
 from vusfa.experiments.runs import Run, read_runs
+from vusfa.limits import listing
 from vusfa.modules.config import MODELS
 from vusfa.scenes import SceneSet
 
@@ -111,7 +112,7 @@ def read_experiment(root: str | Path, names: Sequence[str], scenes: SceneSet | N
         where = Path(root) / runs[0].experiment / runs[0].name
         raise ResultError(
             f"{where}: of other scenes (fingerprint {evaluated[:12]}, and"
-            f" {', '.join(scenes.names)} have {scenes.fingerprint[:12]}); give those of its evaluation"
+            f" {listing(scenes.names)} have {scenes.fingerprint[:12]}); give those of its evaluation"
         )
     groups: dict[str, list[Run]] = {}
     for run in sorted(runs, key=_order):

@@ -10,6 +10,7 @@ import torch
 
 from vusfa.errors import ConfigError
 from vusfa.evaluation import Episodes
+from vusfa.limits import listing
 from vusfa.report.runs import LoggedRun
 from vusfa.scenes import Scene, SceneSet
 from vusfa.training.checkpoint import check_scenes, load_checkpoint
@@ -87,5 +88,5 @@ def _check_episodes(run: LoggedRun, world: SceneSet | None) -> None:
         if scene is None or not _walked_in(part, scene):
             raise ConfigError(
                 f"{run.folder}: its episodes in {name!r} are of another scene than the run's"
-                f" ({', '.join(world.names)}); evaluate the run again with vusfa evaluate"
+                f" ({listing(world.names)}); evaluate the run again with vusfa evaluate"
             )

@@ -1,4 +1,4 @@
-"""Scenes from arrays: pictures and graphs of any other program."""
+"""Scenes from arrays, pictures and graphs of any other program, and scenes to files."""
 
 from __future__ import annotations
 
@@ -11,11 +11,13 @@ import numpy as np
 from torch import Tensor
 
 from vusfa.errors import SceneError
+from vusfa.limits import TABLE_STATES
+from vusfa.scenes import store
 
 if TYPE_CHECKING:
     from vusfa.scenes.scene import Scene
 
-__all__ = ["from_arrays"]
+__all__ = ["from_arrays", "save"]
 
 Array = np.ndarray | Tensor | Sequence[Any]
 
@@ -76,3 +78,39 @@ def from_arrays(
     )
     scene.save(path, pictures)
     return cls.load(path)
+
+
+def save(
+    self: Scene,
+    path: str | os.PathLike[str],
+    pictures: Tensor | np.ndarray | Sequence[bytes] | None = None,
+) -> None:
+    """Write the scene, atomically; :meth:`Scene.load` reads exactly equal numbers.
+
+    Other entries of the scene's file (further datasets, attributes of datasets) are copied, too.
+
+    Args:
+        path: file to write; replaced if it exists.
+        pictures: (N, H, W, 3) uint8, or N JPEG files as bytes; None copies those of the scene's file as
+            they are.
+
+    Raises:
+        SceneError: the pictures do not fit, an attribute cannot be written, or the folder does not exist.
+    """
+    in_file = self.path is not None and (self.has_pictures or self.path.is_file())
+    small = self.num_states <= TABLE_STATES
+    store.write(
+        path,
+        {
+            "graph": self.graph.numpy(),
+            "resnet_feature": self.features.numpy(),
+            "location": self.location.numpy(),
+            "rotation": self.rotation.numpy(),
+            **({"shortest_path_distance": self.distance.numpy()} if small else {}),
+        },
+        name=self.name,
+        actions=self.actions,
+        attributes=self.attributes,
+        pictures=pictures.cpu().numpy() if isinstance(pictures, Tensor) else pictures,
+        source=self.path if in_file else None,
+    )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import OrderedDict
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -12,7 +13,20 @@ from vusfa.errors import SceneError
 from vusfa.limits import MAX_DISTANCE_STATES, MAX_PATH_BYTES
 from vusfa.scenes.graph import BackwardSearch, narrow_distances, shortest_path_distances
 
-__all__ = ["ShortestPaths"]
+if TYPE_CHECKING:
+    from vusfa.scenes.scene import Scene
+
+__all__ = ["DistanceField", "ShortestPaths"]
+
+
+class DistanceField:
+    """The field ``Scene.distance``: the given table, until it is checked; then a table made on request."""
+
+    def __get__(self, scene: Scene | None, owner: type) -> Any:
+        return None if scene is None else scene._paths.table
+
+    def __set__(self, scene: Scene, value: Any) -> None:
+        vars(scene)["_distance"] = value
 
 
 class ShortestPaths:

@@ -11,16 +11,19 @@ from pathlib import Path
 from typing import Any
 
 from vusfa.errors import SceneError
-from vusfa.limits import MAX_FAULTS
+from vusfa.limits import LAZY_SCENES, MAX_FAULTS
 from vusfa.scenes.scene import Scene
 
-__all__ = ["SUFFIXES", "expanded", "listed", "open_scenes"]
+__all__ = ["SUFFIXES", "Sources", "expanded", "listed", "open_scenes"]
+
+#: Names and paths of scenes, folders and patterns, one or several.
+Sources = str | os.PathLike[str] | Sequence[str | os.PathLike[str]]
 
 #: Endings of scene files.
 SUFFIXES = (".h5", ".hdf5")
 
 
-def expanded(scenes: str | os.PathLike[str] | Sequence[str | os.PathLike[str]]) -> list[Any]:
+def expanded(scenes: Sources) -> list[Any]:
     """Names and files, in order: a folder (``rooms/``) stands for its files ``*.h5`` and ``*.hdf5``, and a
     pattern (``rooms/*_small.h5``) for the files that match it, both sorted by name.
 
@@ -45,13 +48,19 @@ def expanded(scenes: str | os.PathLike[str] | Sequence[str | os.PathLike[str]]) 
     return found
 
 
-def open_scenes(scenes: Any, skip_broken: bool = False) -> tuple[list[str], list[Scene]]:
+def open_scenes(
+    scenes: Sources, skip_broken: bool = False, lazy: bool | None = None
+) -> tuple[list[str], list[Scene]]:
     """Names and paths, expanded, and their scenes; arguments and errors of
     :meth:`vusfa.scenes.SceneSet.open`."""
-    sources, opened, faults = [], [], []
-    for source in expanded(scenes):
+    sources, opened, faults, given = [], [], [], expanded(scenes)
+    lazy = len(given) >= LAZY_SCENES if lazy is None else lazy
+    for source in given:
         try:
-            opened.append(Scene.open(source))
+            scene = Scene.open(source, lazy)
+            if skip_broken and lazy:
+                _ = scene.features  # checked now, because later it could not be left out
+            opened.append(scene)
             sources.append(os.fspath(source))
         except SceneError as error:
             if not skip_broken:
@@ -67,6 +76,6 @@ def open_scenes(scenes: Any, skip_broken: bool = False) -> tuple[list[str], list
     return sources, opened
 
 
-def listed(scenes: Any) -> list[Any]:
+def listed(scenes: Sources) -> list[Any]:
     """One name or path, or several, as a list."""
     return [scenes] if isinstance(scenes, str | os.PathLike) else list(scenes)

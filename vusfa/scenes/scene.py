@@ -7,7 +7,7 @@ blocked. No file stays open: a scene can be pickled, forked and spawned, and pic
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -18,25 +18,15 @@ import torch
 from torch import Tensor
 
 from vusfa.errors import SceneError
-from vusfa.limits import TABLE_STATES
 from vusfa.scenes import store
-from vusfa.scenes.arrays import from_arrays
+from vusfa.scenes.arrays import from_arrays, save
+from vusfa.scenes.features import FeaturesField, StoredFeatures
 from vusfa.scenes.graph import as_states, default_actions, weak_components
-from vusfa.scenes.paths import ShortestPaths
+from vusfa.scenes.paths import DistanceField, ShortestPaths
 from vusfa.scenes.pictures import read_pictures
 from vusfa.scenes.validation import array_faults, raise_faults
 
 __all__ = ["Scene"]
-
-
-class _Distance:
-    """The field ``Scene.distance``: the given table, until it is checked; then a table made on request."""
-
-    def __get__(self, scene: Scene | None, owner: type) -> Any:
-        return None if scene is None else scene._paths.table
-
-    def __set__(self, scene: Scene, value: Any) -> None:
-        vars(scene)["_distance"] = value
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -71,10 +61,10 @@ class Scene:
 
     name: str
     graph: Tensor
-    features: Tensor
+    features: Tensor = FeaturesField()  # type: ignore[assignment]  # noqa: RUF009
     location: Tensor = None  # type: ignore[assignment]
     rotation: Tensor = None  # type: ignore[assignment]
-    distance: Tensor = _Distance()  # type: ignore[assignment]
+    distance: Tensor = DistanceField()  # type: ignore[assignment]  # noqa: RUF009
     actions: tuple[str, ...] = None  # type: ignore[assignment]
     attributes: dict[str, Any] = field(default_factory=dict)
     path: Path | None = None
@@ -102,12 +92,17 @@ class Scene:
         raise_faults(source, array_faults(arrays, actions, optional=["shortest_path_distance"]))
         self._set(arrays, actions)
 
-    def _set(self, arrays: dict[str, np.ndarray], actions: tuple[str, ...] | None) -> None:
+    def _set(
+        self,
+        arrays: dict[str, np.ndarray],
+        actions: tuple[str, ...] | None,
+        stored: StoredFeatures | None = None,
+    ) -> None:
         """Set the fields from checked arrays, which the scene then owns."""
         graph = _tensor(arrays["graph"], np.int64)
         values = {
             "graph": graph,
-            "features": _tensor(arrays["resnet_feature"], np.float32),
+            "features": stored or _tensor(arrays["resnet_feature"], np.float32),
             "location": _tensor(arrays["location"], np.float32),
             "rotation": _tensor(arrays["rotation"], np.float32),
             "_paths": ShortestPaths(graph.numpy(), arrays.get("shortest_path_distance")),
@@ -120,19 +115,24 @@ class Scene:
             object.__setattr__(self, key, value)
 
     @classmethod
-    def load(cls, path: str | os.PathLike[str]) -> Scene:
+    def load(cls, path: str | os.PathLike[str], lazy: bool = False) -> Scene:
         """Read and check a scene file; the file is closed on return.
+
+        Args:
+            path: the file.
+            lazy: leave the features in the file; each access reads and checks them. The file's table of
+                shortest paths is not read either.
 
         Raises:
             SceneError: the file is missing, truncated or has faults; the message lists all of them.
         """
-        dump = store.read(path)
+        dump = store.read(path, lazy)
         raise_faults(path, dump.faults())
         scene = object.__new__(cls)
         fields = {"attributes": dump.attributes, "path": Path(path), "picture_shape": dump.picture_shape}
         for key, value in {"name": dump.name, **fields}.items():
             object.__setattr__(scene, key, value)
-        scene._set(dump.arrays, dump.actions)  # without another copy or check
+        scene._set(dump.arrays, dump.actions, dump.stored)  # without another copy or check
         return scene
 
     @classmethod
@@ -148,58 +148,27 @@ class Scene:
         return cls.load(store.bundled_path(name))
 
     @classmethod
-    def open(cls, source: str | os.PathLike[str]) -> Scene:
+    def open(cls, source: str | os.PathLike[str], lazy: bool = False) -> Scene:
         """A bundled room by name, or a scene file by path.
 
-        A string without suffix and folder is a bundled name, anything else a file.
+        A string without suffix and folder is a bundled name, anything else a file; ``lazy`` as in
+        :meth:`load`.
 
         Raises:
             SceneError: there is no such scene or file, or the file has faults.
         """
         if isinstance(source, str) and not Path(source).suffix and os.sep not in source:
             if source in store.bundled_names():
-                return cls.bundled(source)
+                return cls.load(store.bundled_path(source), lazy)
             if not Path(source).is_file():
                 raise SceneError(
                     f"{source!r} is neither a bundled scene ({', '.join(store.bundled_names())}) nor a file;"
                     f" check the name"
                 )
-        return cls.load(source)
+        return cls.load(source, lazy)
 
     from_arrays = classmethod(from_arrays)
-
-    def save(
-        self, path: str | os.PathLike[str], pictures: Tensor | np.ndarray | Sequence[bytes] | None = None
-    ) -> None:
-        """Write the scene, atomically; :meth:`load` reads exactly equal numbers.
-
-        Other entries of the scene's file (further datasets, attributes of datasets) are copied, too.
-
-        Args:
-            path: file to write; replaced if it exists.
-            pictures: (N, H, W, 3) uint8, or N JPEG files as bytes; None copies those of the scene's file as
-                they are.
-
-        Raises:
-            SceneError: the pictures do not fit, an attribute cannot be written, or the folder does not exist.
-        """
-        in_file = self.path is not None and (self.has_pictures or self.path.is_file())
-        small = self.num_states <= TABLE_STATES
-        store.write(
-            path,
-            {
-                "graph": self.graph.numpy(),
-                "resnet_feature": self.features.numpy(),
-                "location": self.location.numpy(),
-                "rotation": self.rotation.numpy(),
-                **({"shortest_path_distance": self.distance.numpy()} if small else {}),
-            },
-            name=self.name,
-            actions=self.actions,
-            attributes=self.attributes,
-            pictures=pictures.cpu().numpy() if isinstance(pictures, Tensor) else pictures,
-            source=self.path if in_file else None,
-        )
+    save = save
 
     def pictures(self, ids: Any) -> Tensor:
         """Read the pictures of some states from the scene's file.
@@ -253,13 +222,27 @@ class Scene:
         return self._paths.between(state, goal)
 
     def __getstate__(self) -> dict[str, Any]:
-        return {**vars(self), "features": self.features.numpy()}  # not the table shared with a set
+        # as arrays: a tensor would be moved to shared memory, features the whole table shared with a set
+        held = {key: x for key, x in vars(self).items() if key != "graph"}  # which the paths have, too
+        return {key: x.numpy() if isinstance(x, Tensor) else x for key, x in held.items()}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        vars(self).update(state, features=torch.from_numpy(state["features"]))
+        vars(self).update(
+            {key: torch.from_numpy(x) if isinstance(x, np.ndarray) else x for key, x in state.items()}
+        )
+        vars(self)["graph"] = torch.from_numpy(self._paths.graph)
 
     def __repr__(self) -> str:
         return f"Scene({self.name!r}, {self.num_states} states, {self.num_actions} actions)"
+
+    @property
+    def _held(self) -> Tensor | StoredFeatures:
+        return vars(self)["_features"]
+
+    @property
+    def stored(self) -> StoredFeatures | None:
+        """Where the features are, if they are in the scene's file alone."""
+        return self._held if isinstance(self._held, StoredFeatures) else None
 
     @property
     def has_pictures(self) -> bool:
@@ -279,12 +262,12 @@ class Scene:
     @property
     def num_crops(self) -> int:
         """C."""
-        return self.features.shape[1]
+        return self._held.shape[1]
 
     @property
     def feature_size(self) -> int:
         """F."""
-        return self.features.shape[2]
+        return self._held.shape[2]
 
     @cached_property
     def islands(self) -> tuple[tuple[int, ...], ...]:

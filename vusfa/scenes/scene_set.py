@@ -5,8 +5,6 @@ Environments and networks hold these integers and look up everything else here.
 
 from __future__ import annotations
 
-import hashlib
-import os
 from collections.abc import Iterable, Sequence
 from typing import Any
 
@@ -15,9 +13,12 @@ import torch
 from torch import Tensor
 
 from vusfa.errors import SceneError
+from vusfa.limits import listing
+from vusfa.scenes.features import LazyFeatures
 from vusfa.scenes.graph import successor_table
-from vusfa.scenes.places import listed, open_scenes
+from vusfa.scenes.places import Sources, listed, open_scenes
 from vusfa.scenes.scene import Scene
+from vusfa.scenes.statistics import fingerprint
 from vusfa.scenes.store import bundled_names
 from vusfa.scenes.validation import check_alike
 
@@ -32,10 +33,12 @@ class SceneSet:
 
     Attributes:
         scenes: tuple of :class:`Scene`, always on the CPU.
+        names: their names.
         offsets: (n_scenes + 1,) int64, first global id of each scene, and S.
         successor: (S, A) int64 global ids; a blocked move stays in place.
         blocked: (S, A) bool.
-        features: (S, C, F) float32.
+        features: (S, C, F) float32; of a lazily opened set :class:`~vusfa.scenes.features.LazyFeatures`,
+            which are read from the files when they are indexed.
         scene_id: (S,) int64, index of the scene.
         location: (S, 2) float32, metres, each scene in its own frame.
         rotation: (S,) float32, degrees.
@@ -71,9 +74,14 @@ class SceneSet:
         self.offsets = torch.from_numpy(offsets)
         self.successor = _joined([t.numpy() + n for (t, _), n in zip(tables, offsets[:-1], strict=True)])
         self.blocked = _joined([blocked.numpy() for _, blocked in tables])
-        self.features = _joined([scene.features.numpy() for scene in self.scenes])
-        for scene, first, end in zip(self.scenes, offsets[:-1], offsets[1:], strict=True):
-            object.__setattr__(scene, "features", self.features[first:end])  # one copy, not two
+        self.names = tuple(scene.name for scene in self.scenes)
+        self.features: Any
+        if any(scene.stored for scene in self.scenes):
+            self.features = LazyFeatures(self.scenes)
+        else:
+            self.features = _joined([scene.features.numpy() for scene in self.scenes])
+            for scene, first, end in zip(self.scenes, offsets[:-1], offsets[1:], strict=True):
+                object.__setattr__(scene, "features", self.features[first:end])  # one copy, not two
         self.location = _joined([scene.location.numpy() for scene in self.scenes])
         self.rotation = _joined([scene.rotation.numpy() for scene in self.scenes])
         self.scene_id = torch.from_numpy(np.repeat(np.arange(len(sizes)), sizes))
@@ -88,9 +96,7 @@ class SceneSet:
         return cls(Scene.bundled(name) for name in (bundled_names() if names is None else listed(names)))
 
     @classmethod
-    def open(
-        cls, scenes: str | os.PathLike[str] | Sequence[str | os.PathLike[str]], skip_broken: bool = False
-    ) -> SceneSet:
+    def open(cls, scenes: Sources, skip_broken: bool = False, lazy: bool | None = None) -> SceneSet:
         """Open bundled names and files alike: ``SceneSet.open(["bathroom", "my_room.h5"])``.
 
         Scenes of the same name, such as rooms of a kind from several seeds, are renamed after their files.
@@ -98,6 +104,8 @@ class SceneSet:
         Args:
             scenes: names, files, folders of scene files (``rooms/``) and patterns (``rooms/*_small.h5``).
             skip_broken: leave out files with faults, with a warning that names them.
+            lazy: leave features in the files until they are asked for, scene by scene; a fault of theirs is
+                found then, or here with ``skip_broken``. None: for 100 scenes or more.
 
         Raises:
             SceneError: there is no such scene or file, or the file has faults.
@@ -105,15 +113,15 @@ class SceneSet:
         >>> SceneSet.open("kitchen").num_states
         680
         """
-        sources, opened = open_scenes(scenes, skip_broken)
+        sources, opened = open_scenes(scenes, skip_broken, lazy)
         found = cls(opened)
         found.sources = tuple(sources)
         return found
 
     @property
-    def names(self) -> tuple[str, ...]:
-        """Names of the scenes, in the order of their ids."""
-        return tuple(scene.name for scene in self.scenes)
+    def is_lazy(self) -> bool:
+        """Whether features are read from the files when they are asked for."""
+        return isinstance(self.features, LazyFeatures)
 
     @property
     def num_scenes(self) -> int:
@@ -138,12 +146,12 @@ class SceneSet:
     @property
     def num_crops(self) -> int:
         """C."""
-        return self.features.shape[1]
+        return self.scenes[0].num_crops
 
     @property
     def feature_size(self) -> int:
         """F."""
-        return self.features.shape[2]
+        return self.scenes[0].feature_size
 
     @property
     def device(self) -> torch.device:
@@ -187,7 +195,7 @@ class SceneSet:
         """
         if isinstance(scene, str):
             if scene not in self.names:
-                raise SceneError(f"no scene is called {scene!r}; this set has {', '.join(self.names)}")
+                raise SceneError(f"no scene is called {scene!r}; this set has {listing(self.names)}")
             return self.names.index(scene)
         if not 0 <= scene < self.num_scenes:
             raise SceneError(f"there is no scene {scene}; this set has the scenes 0..{self.num_scenes - 1}")
@@ -269,17 +277,12 @@ class SceneSet:
         True
         """
         if "_fingerprint" not in self.__dict__:
-            digest = hashlib.sha256()
-            for scene in self.scenes:
-                head = (scene.name, scene.actions, tuple(scene.graph.shape), tuple(scene.features.shape))
-                digest.update(repr(head).encode())
-                digest.update(np.ascontiguousarray(scene.graph.numpy(), "<i8").data)
-                digest.update(np.ascontiguousarray(scene.features.numpy(), "<f4").data)
-            self._fingerprint = digest.hexdigest()[:16]
+            scenes = self.scenes
+            self._fingerprint = self.features.summary.fingerprint if self.is_lazy else fingerprint(scenes)
         return self._fingerprint
 
     def __getstate__(self) -> dict[str, Any]:
-        # Send the scenes only; the tables are rebuilt from them.
+        # the scenes only; the tables are rebuilt from them
         return {"scenes": self.scenes, "device": str(self.device)}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
@@ -288,7 +291,7 @@ class SceneSet:
         self.__dict__.update(self.to(state["device"]).__dict__)
 
     def __repr__(self) -> str:
-        return f"SceneSet({', '.join(f'{scene.name}: {scene.num_states}' for scene in self.scenes)})"
+        return f"SceneSet({listing(f'{scene.name}: {scene.num_states}' for scene in self.scenes)})"
 
 
 def _joined(arrays: list[np.ndarray]) -> Tensor:

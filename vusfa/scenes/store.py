@@ -22,11 +22,13 @@ from typing import Any
 
 import h5py
 import numpy as np
+import torch
 
 from vusfa.deprecated import moved_names
 from vusfa.errors import SceneError
 from vusfa.limits import MAX_NAME, TABLE_STATES, brief
 from vusfa.scenes import pictures as picture_files
+from vusfa.scenes.features import StoredFeatures, stamp_of
 from vusfa.scenes.hdf5 import (
     check_heaps,
     copy_others,
@@ -38,7 +40,7 @@ from vusfa.scenes.hdf5 import (
     replaced,
     row_blocks,
 )
-from vusfa.scenes.validation import DATASETS, array_faults
+from vusfa.scenes.validation import DATASETS, array_faults, shape_fault
 
 __all__ = ["Dump", "bundled_names", "bundled_path", "read", "validate", "write"]
 
@@ -56,6 +58,8 @@ class Dump:
         attributes: all other attributes as plain Python values.
         picture_shape: (H, W, 3), or None without usable pictures.
         reading_faults: faults met while reading, one line each, without the file's name.
+        left: datasets that were left in the file, and their shapes fit.
+        stored: the features, where they were.
     """
 
     name: str
@@ -64,11 +68,13 @@ class Dump:
     attributes: dict[str, Any] = field(default_factory=dict)
     picture_shape: tuple[int, int, int] | None = None
     reading_faults: list[str] = field(default_factory=list)
+    left: list[str] = field(default_factory=list)
+    stored: StoredFeatures | None = None
 
     def faults(self) -> list[str]:
         """All faults, including those of the values."""
-        unreadable = [name for name in DATASETS if any(f"{name!r}" in line for line in self.reading_faults)]
-        return self.reading_faults + array_faults(self.arrays, self.actions, optional=unreadable)
+        unread = [name for name in DATASETS if any(f"{name!r}" in line for line in self.reading_faults)]
+        return self.reading_faults + array_faults(self.arrays, self.actions, optional=unread + self.left)
 
 
 def bundled_names() -> tuple[str, ...]:
@@ -94,8 +100,12 @@ def bundled_path(name: str) -> Path:
     return _BUNDLED / f"{name}.h5"
 
 
-def read(path: str | os.PathLike[str]) -> Dump:
+def read(path: str | os.PathLike[str], lazy: bool = False) -> Dump:
     """Read everything but the pictures; faults are collected, not raised.
+
+    Args:
+        path: the file.
+        lazy: leave features and distances in the file.
 
     Raises:
         SceneError: the file is missing or cannot be opened as HDF5.
@@ -105,6 +115,7 @@ def read(path: str | os.PathLike[str]) -> Dump:
     """
     path = Path(path)
     with opened(path) as file:
+        stamp = stamp_of(path)
         attributes = read_attributes(file, check_heaps(path))
         dump = Dump(name=str(attributes.pop("scene", path.stem)))
         if len(dump.name) > MAX_NAME or not dump.name.isprintable():
@@ -120,15 +131,23 @@ def read(path: str | os.PathLike[str]) -> Dump:
                 dataset = dataset_in(file, name)
                 if dataset is None:
                     continue
-                if name == "resnet_feature":
+                if lazy and name == "resnet_feature":
+                    alike = np.broadcast_to(np.zeros((), dataset.dtype), dataset.shape)
+                    fault = shape_fault(name, alike, len(dump.arrays.get("graph", alike)))
+                    if fault is None:
+                        dump.left.append(name)
+                        dump.stored = StoredFeatures(path.resolve(), torch.Size(dataset.shape), stamp)
+                    else:
+                        dump.reading_faults.append(fault)
+                elif name == "resnet_feature":
                     dump.arrays[name] = read_features(dataset)
                 elif name != "shortest_path_distance":
                     dump.arrays[name] = np.asarray(dataset[()])
-                elif dataset.shape[:1] <= (TABLE_STATES,):
+                elif not lazy and dataset.shape[:1] <= (TABLE_STATES,):
                     dump.arrays[name] = read_distances(dataset)
-                elif (
-                    dataset.shape != np.shape(dump.arrays.get("graph", ()))[:1] * 2
-                ):  # not read, but it must fit
+                elif dataset.shape == np.shape(dump.arrays.get("graph", ()))[:1] * 2:
+                    dump.left.append(name)
+                else:
                     dump.arrays[name] = np.broadcast_to(np.zeros((), dataset.dtype), dataset.shape)
             except (OSError, RuntimeError, TypeError, ValueError) as error:
                 dump.reading_faults.append(

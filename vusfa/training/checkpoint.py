@@ -40,7 +40,7 @@ from torch import Tensor
 from vusfa.conf.settings import flat
 from vusfa.errors import CheckpointError, SceneError, VusfaError
 from vusfa.files import replacing
-from vusfa.limits import brief
+from vusfa.limits import brief, listing
 from vusfa.modules import Agent, make_agent
 from vusfa.scenes import SceneSet
 from vusfa.training.content import NO_VALIDATION, check_entries, check_like, mended, read_content
@@ -158,12 +158,12 @@ def check_scenes(path: str | Path, saved: Mapping[str, Any], scenes: SceneSet) -
     """
     if list(saved["names"]) != list(scenes.names):
         raise CheckpointError(
-            f"{path}: trained in {', '.join(saved['names'])}, not in {', '.join(scenes.names)};"
+            f"{path}: trained in {listing(saved['names'])}, not in {listing(scenes.names)};"
             " give it its own scenes"
         )
     if saved["fingerprint"] != scenes.fingerprint:
         raise CheckpointError(
-            f"{path}: its scenes are called {', '.join(scenes.names)}, too, but their graphs or features"
+            f"{path}: its scenes are called {listing(scenes.names)}, too, but their graphs or features"
             " have changed since; give it the files that it was trained on"
         )
 

@@ -10,13 +10,14 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+import numpy as np
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
 from vusfa.scenes import SceneSet
 
-__all__ = ["EpisodeMeter", "MeanMeter"]
+__all__ = ["EpisodeMeter", "MeanMeter", "quantiles"]
 
 # The table of sums has five rows: episodes, successes, length, length of the successes, their shortest paths.
 _EPISODES = 0
@@ -47,6 +48,8 @@ class EpisodeMeter:
         self._scene_names = scenes.names
         local = scenes.local_id(goals.to(scenes.scene_id.device)).tolist()
         self._names = [f"{scenes.names[s]}/{g}" for s, g in zip(self._scene.tolist(), local, strict=True)]
+        self.is_aggregated = len(scenes.names) > MAX_SCENES or len(self._names) > MAX_GOALS
+        self._totals = torch.zeros(5, len(goals) if self.is_aggregated else 0, dtype=torch.float64)
         self._clear()
 
     def _clear(self) -> None:
@@ -107,18 +110,38 @@ class EpisodeMeter:
             for name, column in zip(self._names, sums.T.tolist(), strict=True):
                 rates = _rates(column)
                 result |= {f"goal/{name}/{key}": rates[key] for key in ("success", "length_ratio")}
+        if self.is_aggregated:
+            self._totals += sums
         self._clear()
         return result
 
+    def table(self) -> dict[str, np.ndarray]:
+        """Sums over all episodes, those before the last :meth:`flush` included, where goals or scenes are
+        too many for columns of their own in the log.
+
+        Returns:
+            columns (G,): ``scene``, the name; ``goal``, the id within it; ``episodes``, ``successes``, and
+            the actions of all episodes (``length``), of the successful ones (``success_length``) and of their
+            shortest paths (``success_shortest``).
+        """
+        names = ("episodes", "successes", "length", "success_length", "success_shortest")
+        scene, goal = zip(*(name.rsplit("/", 1) for name in self._names), strict=True)
+        columns = dict(zip(names, (self._totals + self._sums).numpy(), strict=True))
+        return {"scene": np.array(scene), "goal": np.array(goal, np.int64), **columns}
+
     def state_dict(self) -> dict[str, Tensor]:
-        """The sums since the last :meth:`flush`."""
-        return {"sums": self._sums, "frames": torch.tensor(self._frames), "collisions": self._collisions}
+        """The sums since the last :meth:`flush`, and those of :meth:`table` where there is one."""
+        totals = {"totals": self._totals} if self.is_aggregated else {}
+        since = {"sums": self._sums, "frames": torch.tensor(self._frames), "collisions": self._collisions}
+        return since | totals
 
     def load_state_dict(self, state: Mapping[str, Tensor]) -> None:
         """Go on from what :meth:`state_dict` gave, for the same goals."""
         self._sums = state["sums"].cpu()
         self._frames = int(state["frames"])
         self._collisions = state["collisions"].cpu()
+        if self.is_aggregated:
+            self._totals = state["totals"].cpu()
 
 
 class MeanMeter:
@@ -171,12 +194,19 @@ class MeanMeter:
 def _spread(name: str, sums: Tensor) -> dict[str, float]:
     """Of the columns of a table of sums that have episodes: their number, and quantiles of their success."""
     seen = sums[:, sums[_EPISODES] > 0]
-    quantiles = (seen[1] / seen[_EPISODES]).quantile(seen.new_tensor(_QUANTILES)) if seen.numel() else None
-    found = [math.nan] * len(_QUANTILES) if quantiles is None else quantiles.tolist()
-    return {
-        f"{name}/seen": float(seen.shape[1]),
-        **{f"{name}/success_p{100 * q:.0f}": value for q, value in zip(_QUANTILES, found, strict=True)},
-    }
+    success = quantiles(f"{name}/success", seen[1] / seen[_EPISODES])
+    return {f"{name}/seen": float(seen.shape[1]), **success}
+
+
+def quantiles(name: str, values: Tensor) -> dict[str, float]:
+    """Quantiles of values (n,) but for NaN, which they are where there is none.
+
+    >>> quantiles("success", torch.tensor([0.0, 0.5, 1.0, math.nan]))
+    {'success_p10': 0.10..., 'success_p50': 0.5, 'success_p90': 0.89...}
+    """
+    known = values[~values.isnan()]
+    found = known.quantile(known.new_tensor(_QUANTILES)).tolist() if len(known) else [math.nan] * 3
+    return {f"{name}_p{100 * q:.0f}": value for q, value in zip(_QUANTILES, found, strict=True)}
 
 
 def _rates(sums: Sequence[float]) -> dict[str, float]:

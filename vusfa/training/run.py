@@ -10,17 +10,21 @@ from pathlib import Path
 from tensordict import TensorDictBase
 
 from vusfa.errors import ResultError, VusfaError, WorkerError
-from vusfa.files import replacing
+from vusfa.files import replacing, write_npz
 from vusfa.training.folder import BEST
 from vusfa.training.loggers import Logger
 from vusfa.training.progress import ProgressLine
 from vusfa.training.signals import StopOnSignal
 from vusfa.training.trainer import Trainer
 
-__all__ = ["SCORE", "Validate", "run_training"]
+__all__ = ["EPISODES", "SCORE", "Validate", "run_training"]
 
 #: The metric by which the best checkpoint is chosen; more is better.
 SCORE = "eval/validation/spl"
+
+#: File beside the checkpoint, of trainings with too many scenes or goals for columns of their own in the log,
+#: see :meth:`vusfa.training.metrics.EpisodeMeter.table`.
+EPISODES = "episodes.npz"
 
 #: Evaluation during a training, called at every line of the log with whether it is the last: metrics, the
 #: same names each time, NaN where none was due. :class:`vusfa.experiments.validation.Validation` is one.
@@ -104,6 +108,8 @@ def _run(
 
 def _save(trainer: Trainer, checkpoint: Path, loggers: Logger, is_best: bool = False) -> None:
     trainer.save(checkpoint)
+    if trainer.episodes.is_aggregated:
+        write_npz(checkpoint.with_name(EPISODES), trainer.episodes.table())
     if is_best:
         with replacing(checkpoint.with_name(BEST)) as unfinished:
             shutil.copyfile(checkpoint, unfinished)

@@ -27,9 +27,9 @@ def scene_sources(scenes: str | Sequence[str], folder: str | Path) -> list[str]:
     >>> scene_sources(["kitchen", "rooms/hall.h5"], "runs/a")
     ['kitchen', '../../rooms/hall.h5']
     """
-    given = [scenes] if isinstance(scenes, str) else list(scenes)
+    given, bundled = [scenes] if isinstance(scenes, str) else list(scenes), bundled_names()
     return [
-        name if name in bundled_names() else os.path.relpath(os.path.realpath(name), os.path.realpath(folder))
+        name if name in bundled else os.path.relpath(os.path.realpath(name), os.path.realpath(folder))
         for name in given
     ]
 

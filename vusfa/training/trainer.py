@@ -180,7 +180,7 @@ class Trainer:
             step(total_loss(more))
             terms.update(more)
         self.algorithm.after_step()
-        terms["grad_norm"] = norm
+        terms = {name: value.detach() for name, value in terms.items()} | {"grad_norm": norm}
         self.frames += batch.numel()
         self.updates += 1
         self.episodes.update(batch)
