@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import math
 import mmap
+import os
 import uuid
 from collections.abc import Collection, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -31,6 +32,8 @@ __all__ = [
 ]
 
 _NUMBERS_AT_ONCE = 1 << 22
+#: Size up to which reading a file costs less than mapping it.
+_READ_WHOLE = 1 << 20
 
 
 @contextmanager
@@ -73,7 +76,13 @@ def check_heaps(path: Path) -> int:
         SceneError: a heap is damaged.
     """
     objects = largest = 0
-    with open(path, "rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
+    with ExitStack() as stack:
+        file = stack.enter_context(open(path, "rb"))
+        data: bytes | mmap.mmap
+        if os.fstat(file.fileno()).st_size <= _READ_WHOLE:
+            data = file.read()
+        else:
+            data = stack.enter_context(mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ))
         heap = data.find(b"GCOL")
         while heap >= 0:
             end = heap + int.from_bytes(data[heap + 8 : heap + 16], "little")
@@ -97,13 +106,16 @@ def read_attributes(file: h5py.File, largest: int) -> dict[str, Any]:
     Raises:
         OSError: an attribute declares more than :data:`vusfa.limits.MAX_ATTRIBUTE_BYTES`.
     """
-    for key in file.attrs:
-        declared = file.attrs.get_id(key)
-        held = largest if declared.dtype.hasobject else declared.dtype.itemsize
+    values, attributes = {}, file.attrs
+    for key in attributes:
+        declared = attributes.get_id(key)
+        kind = declared.dtype
+        held = largest if kind.hasobject else kind.itemsize
         size, most = math.prod(declared.shape or ()) * held, limits.MAX_ATTRIBUTE_BYTES
         if size > most:
             raise OSError(f"attribute {brief(key)} declares up to {size} bytes; at most {most} are read")
-    return {key: plain(value) for key, value in file.attrs.items()}
+        values[key] = plain(attributes[key])
+    return values
 
 
 @contextmanager
@@ -134,16 +146,21 @@ def dataset_in(file: h5py.File, name: str) -> h5py.Dataset | None:
         OSError: its data lie outside the file (a link, external storage, a virtual dataset), or it declares
             more than :mod:`vusfa.limits` allows. Nothing outside the file is opened.
     """
-    link = file.get(name, getlink=True)
-    if link is None:
+    links, key = (
+        file.id.links,
+        name.encode(),
+    )  # of the low-level interface, which takes a fraction of the time
+    if not links.exists(key):
         return None
-    if not isinstance(link, h5py.HardLink):
+    if links.get_info(key).type != h5py.h5l.TYPE_HARD:
         raise OSError("it is a link to another place; store the data in the file itself")
-    found = file[name]
-    if not isinstance(found, h5py.Dataset):
+    there = h5py.h5o.open(file.id, key)
+    if not isinstance(there, h5py.h5d.DatasetID):
         return None
-    if found.external or found.is_virtual:
+    made = there.get_create_plist()
+    if made.get_external_count() or made.get_layout() == h5py.h5d.VIRTUAL:
         raise OSError("its data lie outside the file; store them in the file itself")
+    found = h5py.Dataset(there)
     fault = size_fault(found)
     if fault is not None:
         raise OSError(fault)
@@ -224,21 +241,22 @@ def _copy_attributes(source: h5py.Dataset, target: h5py.Dataset) -> None:
 
 def size_fault(dataset: h5py.Dataset) -> str | None:
     """Fault of a dataset that declares more than it can hold or more than may be read; None without one."""
-    declared, stored = dataset.nbytes, dataset.id.get_storage_size()
-    if dataset.shape and dataset.shape[0] > limits.MAX_STATES:
-        return f"declares {dataset.shape[0]} states; at most {limits.MAX_STATES} are read"
-    times = limits.MAX_PICTURE_COMPRESSION if dataset.ndim == 4 else limits.MAX_COMPRESSION
+    shape, itemsize, stored = dataset.shape or (), dataset.dtype.itemsize, dataset.id.get_storage_size()
+    declared = math.prod(shape) * itemsize if dataset.shape is not None else 0
+    if shape and shape[0] > limits.MAX_STATES:
+        return f"declares {shape[0]} states; at most {limits.MAX_STATES} are read"
+    times = limits.MAX_PICTURE_COMPRESSION if len(shape) == 4 else limits.MAX_COMPRESSION
     if declared > max(limits.UNCOMPRESSED_BYTES, times * stored):
         return f"declares {declared} bytes, but {stored} are stored; at most {times} times that are read"
-    most, needed = limits.MAX_EXTRA_BYTES, 4 * math.prod(dataset.shape or ())
-    if dataset.ndim == 3 and needed > stored + most:
+    most, needed = limits.MAX_EXTRA_BYTES, 4 * math.prod(shape)
+    if len(shape) == 3 and needed > stored + most:
         return (
             f"needs {needed} bytes as float32, but {stored} are stored; at most {most} more are allowed:"
             " store float32, or fewer crops"
         )
-    most = limits.MAX_CHUNK_BYTES
-    if dataset.chunks and math.prod(dataset.chunks) * dataset.dtype.itemsize > most:
-        return f"has chunks of shape {dataset.chunks}; at most {most} bytes per chunk are read"
+    most, chunks = limits.MAX_CHUNK_BYTES, dataset.chunks
+    if chunks and math.prod(chunks) * itemsize > most:
+        return f"has chunks of shape {chunks}; at most {most} bytes per chunk are read"
     return None
 
 

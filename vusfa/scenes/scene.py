@@ -109,7 +109,7 @@ class Scene:
             "actions": actions or default_actions(arrays["graph"].shape[1]),
             "attributes": dict(self.attributes),
             # Workers may run in another working directory.
-            "path": None if self.path is None else Path(self.path).resolve(),
+            "path": stored.path if stored else None if self.path is None else Path(self.path).resolve(),
         }
         for key, value in values.items():
             object.__setattr__(self, key, value)
