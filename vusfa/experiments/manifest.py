@@ -120,7 +120,7 @@ def draw_goals(scenes: SceneSet, goals: Tensor, per_scene: int, generator: torch
 def write_manifest(path: str | Path, manifest: Manifest) -> Path:
     """Write a manifest (.npz), atomically; ids as 32-bit integers."""
     columns = {name: getattr(manifest, name).numpy().astype(np.int32) for name in ("start", "goal")}
-    others = {"seed": np.int64(manifest.seed), "fingerprint": np.array(manifest.fingerprint)}
+    others = {"seed": np.asarray(np.int64(manifest.seed)), "fingerprint": np.array(manifest.fingerprint)}
     return write_npz(path, {**columns, "validation": manifest.validation.numpy(), **others})
 
 

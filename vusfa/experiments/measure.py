@@ -178,7 +178,8 @@ def probabilities_by_scene(
         goals: (G,) global ids of the only goals to come; None for all states.
     """
     every = torch.arange(scenes.num_states) if goals is None else goals.cpu()
-    scene_of, latest = scenes.scene_id.cpu()[every], {}
+    scene_of = scenes.scene_id.cpu()[every]
+    latest: dict[int, TabularPolicy] = {}
 
     def probabilities(state: torch.Tensor, goal: torch.Tensor, scene: torch.Tensor) -> torch.Tensor:
         index = int(scene[0])

@@ -57,14 +57,11 @@ class FeatureFrames(nn.Module):
         self.register_buffer("_converted", None, persistent=False)  # as autocast would
         if normalize:
             if self._features is None:
-                spread = table.std(0, correction=0), table.abs().amax(0)
-                self.register_buffer("mean", table.mean(0))
+                mean, spread, largest = table.mean(0), table.std(0, correction=0), table.abs().amax(0)
             else:
-                _, mean, *spread = (
-                    part if isinstance(part, str) else part.to(table) for part in self._features.summary
-                )
-                self.register_buffer("mean", mean)
-            self.register_buffer("deviation", _deviation(*spread, len(features)))
+                mean, spread, largest = (column.to(table) for column in self._features.summary.columns)
+            self.register_buffer("mean", mean)
+            self.register_buffer("deviation", _deviation(spread, largest, len(features)))
             # Kept as the encoder wants it, and brought up to date when other numbers are loaded.
             self.table = (self.table - self.mean) / self.deviation
             self._register_load_state_dict_pre_hook(self._renormalize)

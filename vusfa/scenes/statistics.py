@@ -42,6 +42,11 @@ class FeatureSummary(NamedTuple):
     deviation: Tensor
     largest: Tensor
 
+    @property
+    def columns(self) -> tuple[Tensor, Tensor, Tensor]:
+        """Mean, deviation and largest absolute value."""
+        return self.mean, self.deviation, self.largest
+
 
 def fingerprint(scenes: Sequence[Scene]) -> str:
     """16 hexadecimal digits of a SHA-256 over names, actions, graphs and features."""

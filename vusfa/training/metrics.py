@@ -140,7 +140,7 @@ class EpisodeMeter:
         self._sums = state["sums"].cpu()
         self._frames = int(state["frames"])
         self._collisions = state["collisions"].cpu()
-        if self.is_aggregated:
+        if "totals" in state:
             self._totals = state["totals"].cpu()
 
 
