@@ -20,7 +20,6 @@ from vusfa.experiments.validation import Validation
 from vusfa.modules import InferencePolicy, TabularPolicy, make_agent
 from vusfa.scenes import Scene, SceneSet
 from vusfa.training import Trainer, make_loggers, make_trainer
-from vusfa.training.run import EPISODES
 
 SMALL = [
     *(f"agent.{name}=8" for name in ("hidden_size", "embedding_size")),
@@ -176,7 +175,6 @@ def test_sums_of_too_many_goals_for_columns_are_a_table(
     assert logged["episodes"] == first > 0
     assert not [name for name in logged if name.startswith("goal/")]
     assert trainer.episodes.table()["episodes"].sum() == first  # of the whole training
-    assert EPISODES == "episodes.npz"
 
 
 def test_an_autoencoder_needs_all_features_at_once(

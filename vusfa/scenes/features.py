@@ -154,9 +154,9 @@ class LazyFeatures:
 
     def __getitem__(self, index: Any) -> Tensor:
         ids, *rest = index if isinstance(index, tuple) else (index,)
-        ids = torch.arange(len(self))[ids] if isinstance(ids, slice) else torch.as_tensor(ids)
+        ids = torch.arange(len(self))[ids.cpu() if isinstance(ids, Tensor) else ids]
         found = torch.empty(ids.numel(), *self.shape[1:])
-        flat = ids.reshape(-1).cpu()
+        flat = ids.reshape(-1)
         scene = torch.bucketize(flat, self.offsets, right=True) - 1
         for one in scene.unique().tolist():
             rows = scene == one

@@ -16,14 +16,14 @@ from typing import Any
 from vusfa.errors import ConfigError
 from vusfa.files import check_folder, remove_leftovers
 
-__all__ = ["AUTO", "BEST", "CHECKPOINT", "RunFolder", "default_folder", "found_checkpoint"]
+__all__ = ["AUTO", "BEST", "CHECKPOINT", "EPISODES", "RunFolder", "default_folder", "found_checkpoint"]
 
 #: ``resume`` of a run that goes on if there is something to go on with.
 AUTO = "auto"
 
 #: The last checkpoint of a run, and the one with the best score of its evaluations during the training.
-CHECKPOINT, BEST = "checkpoint.pt", "best.pt"
-_OF_A_RUN = (CHECKPOINT, BEST, "metrics.csv", "validation.csv")
+CHECKPOINT, BEST, EPISODES = "checkpoint.pt", "best.pt", "episodes.npz"
+_OF_A_RUN = (CHECKPOINT, BEST, EPISODES, "metrics.csv", "validation.csv")
 _EVALUATION = ("evaluation.csv", "evaluation.json", "evaluation_episodes.csv")
 _LOCK = ".lock"
 

@@ -11,20 +11,16 @@ from tensordict import TensorDictBase
 
 from vusfa.errors import ResultError, VusfaError, WorkerError
 from vusfa.files import replacing, write_npz
-from vusfa.training.folder import BEST
+from vusfa.training.folder import BEST, EPISODES
 from vusfa.training.loggers import Logger
 from vusfa.training.progress import ProgressLine
 from vusfa.training.signals import StopOnSignal
 from vusfa.training.trainer import Trainer
 
-__all__ = ["EPISODES", "SCORE", "Validate", "run_training"]
+__all__ = ["SCORE", "Validate", "run_training"]
 
 #: The metric by which the best checkpoint is chosen; more is better.
 SCORE = "eval/validation/spl"
-
-#: File beside the checkpoint, of trainings with too many scenes or goals for columns of their own in the log,
-#: see :meth:`vusfa.training.metrics.EpisodeMeter.table`.
-EPISODES = "episodes.npz"
 
 #: Evaluation during a training, called at every line of the log with whether it is the last: metrics, the
 #: same names each time, NaN where none was due. :class:`vusfa.experiments.validation.Validation` is one.
@@ -45,7 +41,8 @@ def run_training(
     Args:
         trainer: new, or resumed.
         checkpoint: file, written at intervals, where :data:`SCORE` is the best so far, and at the end;
-            ``best.pt`` beside it is a copy of the best.
+            ``best.pt`` beside it is a copy of the best, and ``episodes.npz`` has what is too much for columns
+            of the log, :meth:`~vusfa.training.metrics.EpisodeMeter.table`.
         loggers: receive metrics and checkpoints.
         stop: checked after each update.
         progress: the live line.
