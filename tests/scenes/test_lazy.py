@@ -54,7 +54,7 @@ def test_what_is_read_is_what_is_there(both: tuple[SceneSet, SceneSet]) -> None:
     assert torch.equal(lazy.features[ids], eager.features[ids])
     assert torch.equal(lazy.features[ids, 0], eager.features[ids, 0])
     assert torch.equal(lazy.features[:], eager.features)
-    for index in (-1, 55, slice(3, 40, 7), [2, -2], torch.tensor(4), eager.scene_id == 1):
+    for index in (-1, 55, slice(3, 40, 7), [2, 50], torch.tensor(4), eager.scene_id == 1):
         assert torch.equal(lazy.features[index], eager.features[index])
     assert torch.equal(lazy.features[-3:, 0, 2:4], eager.features[-3:, 0, 2:4])
     with pytest.raises(IndexError):

@@ -156,7 +156,7 @@ class LazyFeatures:
         ids, *rest = index if isinstance(index, tuple) else (index,)
         ids = torch.arange(len(self))[ids.cpu() if isinstance(ids, Tensor) else ids]
         found = torch.empty(ids.numel(), *self.shape[1:])
-        flat = ids.reshape(-1)
+        flat = ids.reshape(-1).contiguous()
         scene = torch.bucketize(flat, self.offsets, right=True) - 1
         for one in scene.unique().tolist():
             rows = scene == one
@@ -213,7 +213,7 @@ class SceneRows:
         """
         if ids is None:
             ids = torch.arange(self.num_states)
-        flat = ids.reshape(-1)
+        flat = ids.reshape(-1).contiguous()
         if self._place is None or self._place.device != flat.device:
             self.clear()
             self._place = torch.full((self.num_states,), -1, device=flat.device)
