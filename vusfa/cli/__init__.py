@@ -26,6 +26,7 @@ COMMANDS = [
     "vusfa.cli.encode",
     "vusfa.cli.fetch",
     "vusfa.cli.render",
+    "vusfa.cli.render_rooms",
     "vusfa.cli.compact",
 ]
 

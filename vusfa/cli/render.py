@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -13,7 +14,25 @@ from vusfa.errors import ConfigError
 if TYPE_CHECKING:
     from vusfa.sources.render.plan import Plan
 
-__all__ = ["register"]
+__all__ = ["Samples", "Scalar", "Threads", "Weights", "Width", "find_plan", "register", "with_camera"]
+
+Width = Annotated[
+    int | None,
+    typer.Option(
+        min=16, help="Width of the pictures in pixels; the height follows. By default the plan's, 200."
+    ),
+]
+Samples = Annotated[
+    int | None, typer.Option(min=1, help="Light paths per pixel before denoising; by default the plan's, 4.")
+]
+Weights = Annotated[Path | None, typer.Option(help="File of the network's weights.")]
+Scalar = Annotated[
+    bool, typer.Option("--scalar", help="Render without LLVM even if it is installed; much slower.")
+]
+Threads = Annotated[
+    int | None,
+    typer.Option(min=1, help="Number of threads; by default one per core, or one without LLVM."),
+]
 
 
 def register(scenes: typer.Typer) -> None:
@@ -21,19 +40,34 @@ def register(scenes: typer.Typer) -> None:
     scenes.command("render")(render)
 
 
-def _plan(plan: Path | None, kind: str | None, flat: str | None, seed: int, cells: int | None) -> Plan:
+def find_plan(path: Path) -> Plan:
+    """The plan of a file, or of a bundled room by its name."""
     from vusfa.sources.render import catalogue
+    from vusfa.sources.render.plan_file import load_plan
+
+    bundled = Path(catalogue.__file__).with_name("plans") / f"{path}.yaml"
+    return load_plan(bundled if bundled.is_file() and not path.is_file() else path)
+
+
+def with_camera(plan: Plan, width: int | None, samples: int | None) -> Plan:
+    """The plan with pictures of another width, and of the same shape, or with another number of samples."""
+    camera = plan.camera
+    if width is not None:
+        columns, rows = camera.resolution
+        camera = replace(camera, resolution=(width, max(1, round(width * rows / columns))))
+    return replace(plan, camera=camera if samples is None else replace(camera, samples=samples))
+
+
+def _plan(plan: Path | None, kind: str | None, flat: str | None, seed: int, cells: int | None) -> Plan:
     from vusfa.sources.render.flat import flat as draw_flat
     from vusfa.sources.render.layout import layout
-    from vusfa.sources.render.plan_file import load_plan
 
     if sum(source is not None for source in (plan, kind, flat)) != 1:
         raise ConfigError("say what to render: --plan FILE, --kind KIND or --flat KIND,KIND,...")
     if plan is not None:
         if cells is not None:
             raise ConfigError("--cells belongs to --kind and --flat; a plan has its size")
-        bundled = Path(catalogue.__file__).with_name("plans") / f"{plan}.yaml"
-        return load_plan(bundled if bundled.is_file() and not plan.is_file() else plan)
+        return find_plan(plan)
     if flat is not None:
         return draw_flat([room.strip() for room in flat.split(",")], seed, cells)
     assert kind is not None
@@ -64,17 +98,21 @@ def render(
     plan_only: Annotated[
         bool, typer.Option("--plan-only", help="Write the plan, a YAML file to look at and change.")
     ] = False,
+    vary: Annotated[
+        str | None,
+        typer.Option(
+            help="Change the pictures, not the states: noise, brighter, dimmer, camera, fov, moved, jpeg,"
+            " blur, all, train1, train2, or a YAML file of changes."
+        ),
+    ] = None,
     backbone: Annotated[
         str, typer.Option(help="Network that computes the features; see `vusfa scenes encode --help`.")
     ] = "efficientnet-lite0",
-    weights: Annotated[Path | None, typer.Option(help="File of the network's weights.")] = None,
-    scalar: Annotated[
-        bool, typer.Option("--scalar", help="Render without LLVM even if it is installed; much slower.")
-    ] = False,
-    threads: Annotated[
-        int | None,
-        typer.Option(min=1, help="Number of threads; by default one per core, or one without LLVM."),
-    ] = None,
+    weights: Weights = None,
+    width: Width = None,
+    samples: Samples = None,
+    scalar: Scalar = False,
+    threads: Threads = None,
     force: Force = False,
 ) -> None:
     """Render a room or a flat: from its plan, or drawn and furnished from a kind and a seed.
@@ -95,15 +133,21 @@ def render(
 
         vusfa scenes render --plan bathroom -o again.h5
 
+        vusfa scenes render --plan bathroom --vary dimmer -o dimmer.h5
+
         vusfa scenes render --flat kitchen,hall,bedroom,bathroom --cells 500
     """
     from vusfa.sources.render.grid import poses
     from vusfa.sources.render.plan_file import save_plan
+    from vusfa.sources.render.variation import PLAIN, load_variation
 
+    if vary is not None and plan_only:
+        raise ConfigError("--vary changes pictures, and --plan-only makes none; leave out one of them")
+    variation = PLAIN if vary is None else load_variation(vary)
     name = plan.stem if plan is not None else f"{kind or 'flat'}-{seed}"
     target = output or Path(f"{name}.yaml" if plan_only else f"{name}.h5")
     check_target(target, force)
-    room = _plan(plan, kind, flat, seed, cells)
+    room = with_camera(_plan(plan, kind, flat, seed, cells), width, samples)
     if plan_only:
         from vusfa.sources.render.catalogue import Catalogue
 
@@ -133,6 +177,7 @@ def render(
             backend=Backend("scalar_rgb") if scalar else None,
             threads=threads,
             say=lambda line: typer.echo(line, err=True),
+            variation=variation,
         )
     typer.echo(str(rendered))
     say_next(target)

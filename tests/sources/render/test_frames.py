@@ -45,6 +45,7 @@ def _all(folder: Path, *stops: int | None) -> tuple[np.ndarray, list[int]]:
         painter = Painter(stop)
         done: list[int] = []
         try:
+            frames.measure(painter, lambda frames=frames, done=done: done.append(frames.done))
             frames.render(painter, lambda frames=frames, done=done: done.append(frames.done))
         except Stopped:
             assert not frames.complete
@@ -70,7 +71,7 @@ def test_a_stop_costs_no_frame_and_changes_none(tmp_path: Path, stops: tuple[int
 def test_frames_of_other_work_are_thrown_away(tmp_path: Path) -> None:
     frames = Frames(PLAN, ROOM, tmp_path / "a.h5", {"version": 1})
     with pytest.raises(Stopped):
-        frames.render(Painter(5), lambda: None)
+        frames.measure(Painter(5), lambda: None)
     assert Frames(PLAN, ROOM, tmp_path / "a.h5", {"version": 1}).done == 5
     assert Frames(PLAN, ROOM, tmp_path / "a.h5", {"version": 2}).done == 0
 

@@ -4,7 +4,8 @@ One module for each step: :mod:`kinds <vusfa.sources.render.kinds>`, :mod:`layou
 <vusfa.sources.render.layout>` and :mod:`flat <vusfa.sources.render.flat>` draw a :class:`Plan`; :mod:`grid
 <vusfa.sources.render.grid>` makes its poses and graph; :mod:`textures <vusfa.sources.render.textures>`,
 :mod:`meshes <vusfa.sources.render.meshes>` and :mod:`geometry <vusfa.sources.render.geometry>` its shapes;
-:mod:`renderer <vusfa.sources.render.renderer>` its pictures; and :func:`render_room` its file. Drawing plans
+:mod:`renderer <vusfa.sources.render.renderer>` its pictures, which :mod:`variation
+<vusfa.sources.render.variation>` changes; and :func:`render_room` its file. Drawing plans
 needs no more than this package; rendering needs ``pip install 'vusfa[render]'`` and the furniture of Debian's
 ``sweethome3d-furniture``.
 
@@ -20,16 +21,20 @@ from vusfa.sources.render.layout import layout
 from vusfa.sources.render.plan import Plan
 from vusfa.sources.render.plan_file import from_yaml, load_plan, save_plan, to_yaml
 from vusfa.sources.render.room import Rendered, render_room
+from vusfa.sources.render.variation import VARIATIONS, Variation, load_variation
 
 __all__ = [
+    "VARIATIONS",
     "Catalogue",
     "Plan",
     "Poses",
     "Rendered",
+    "Variation",
     "flat",
     "from_yaml",
     "layout",
     "load_plan",
+    "load_variation",
     "poses",
     "render_room",
     "save_plan",

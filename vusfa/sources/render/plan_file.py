@@ -6,8 +6,9 @@ import dataclasses
 import os
 import types
 import uuid
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any, Union, get_args, get_origin, get_type_hints
+from typing import Any, TypeVar, Union, cast, get_args, get_origin, get_type_hints
 
 import yaml
 
@@ -17,7 +18,9 @@ from vusfa.reading import parse_yaml, read_text
 from vusfa.sources.render.faults import plan_faults
 from vusfa.sources.render.plan import Plan
 
-__all__ = ["from_yaml", "load_plan", "save_plan", "to_yaml"]
+__all__ = ["from_yaml", "load_plan", "read_entry", "save_plan", "to_yaml"]
+
+_Kind = TypeVar("_Kind")
 
 
 class _Line(dict[str, Any]):
@@ -111,7 +114,8 @@ def _build(kind: Any, value: Any, where: str, faults: list[str]) -> Any:
 def _build_entry(kind: Any, value: Any, where: str, faults: list[str]) -> Any:
     fields = {field.name: field for field in dataclasses.fields(kind)}
     if not isinstance(value, dict):
-        faults.append(f"{where or 'the plan'}: must be a mapping with the keys {', '.join(fields)}")
+        named = where or f"the {kind.__name__.lower()}"
+        faults.append(f"{named}: must be a mapping with the keys {', '.join(fields)}")
         return None
     hints = get_type_hints(kind)
     before = len(faults)
@@ -131,6 +135,29 @@ def _build_entry(kind: Any, value: Any, where: str, faults: list[str]) -> Any:
     return kind(**values) if len(faults) == before else None
 
 
+def read_entry(kind: type[_Kind], text: str, source: str, check: Callable[[_Kind], list[str]]) -> _Kind:
+    """Read a dataclass from YAML.
+
+    Args:
+        kind: the class.
+        text: the YAML, a mapping of its fields.
+        source: name in errors, such as the file's.
+        check: gives the faults of the values, one line each.
+
+    Raises:
+        SceneError: the text is no YAML, or has faults; the message lists all of them.
+    """
+    content = parse_yaml(text, source, SceneError, "correct it")
+    faults: list[str] = []
+    entry = _build_entry(kind, content, "", faults)
+    faults = faults or check(entry)
+    if len(faults) == 1:
+        raise SceneError(f"{source}: {faults[0]}")
+    if faults:
+        raise SceneError(f"{source}: {len(faults)} faults" + "".join(f"\n  - {fault}" for fault in faults))
+    return cast(_Kind, entry)
+
+
 def from_yaml(text: str, source: str = "plan") -> Plan:
     """Read and check a plan.
 
@@ -148,15 +175,7 @@ def from_yaml(text: str, source: str = "plan") -> Plan:
       - gird: there is no such key; the keys are name, size, kind, ...
       - size: [3, 2] must have 3 entries
     """
-    content = parse_yaml(text, source, SceneError, "correct it")
-    faults: list[str] = []
-    plan = _build_entry(Plan, content, "", faults)
-    faults = faults or plan_faults(plan)
-    if len(faults) == 1:
-        raise SceneError(f"{source}: {faults[0]}")
-    if faults:
-        raise SceneError(f"{source}: {len(faults)} faults" + "".join(f"\n  - {fault}" for fault in faults))
-    return plan
+    return read_entry(Plan, text, source, plan_faults)
 
 
 def load_plan(path: str | os.PathLike[str]) -> Plan:

@@ -14,6 +14,8 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
+import yaml
+
 from vusfa.errors import SceneError
 from vusfa.scenes.graph import default_actions
 from vusfa.scenes.provenance import Provenance, this_tool, today
@@ -29,6 +31,7 @@ from vusfa.sources.render.grid import poses
 from vusfa.sources.render.plan import Plan
 from vusfa.sources.render.plan_file import to_yaml
 from vusfa.sources.render.renderer import Renderer
+from vusfa.sources.render.variation import PLAIN, Variation, vary_plan
 from vusfa.sources.summary import look_alike_share
 
 __all__ = ["Rendered", "credits", "render_room"]
@@ -85,8 +88,9 @@ def _origin(plan: Plan, catalogue: Catalogue) -> Provenance:
 
 
 def _attributes(
-    plan: Plan, catalogue: Catalogue, backend: backends.Backend, exposure: float
+    plan: Plan, catalogue: Catalogue, backend: backends.Backend, exposure: float, variation: Variation
 ) -> dict[str, Any]:
+    changes = variation.changes()
     return {
         "kind": plan.kind or "room",
         "models": [f"{name} {catalogue[name].title}" for name in plan.models],
@@ -98,7 +102,27 @@ def _attributes(
         "hfov_deg": plan.camera.fov,
         "spp": plan.camera.samples,
         "frame": "location=(X right, Z forward); heading 0 = +Z, 90 = +X; RotateRight turns clockwise",
+        **({"variation": yaml.safe_dump(changes, default_flow_style=True).strip()} if changes else {}),
     }
+
+
+def _render_frames(
+    frames: Frames, plan: Plan, varied: Plan, renderer_of: Callable[[Plan], Renderer], report: Progress
+) -> float | None:
+    """Render the missing frames; returns the mean seconds per frame, without loading, or None without any."""
+    spent, renderer = 0.0, None
+    for room, step, ready in (
+        (plan, frames.measure, frames.measured),
+        (varied, frames.render, frames.complete),
+    ):
+        if ready:
+            continue
+        if renderer is None or room != plan:
+            renderer = renderer_of(room)
+        began = time.monotonic()
+        step(renderer.frame, lambda: report("frames", frames.done, frames.total))
+        spent += time.monotonic() - began
+    return spent / frames.rendered if frames.rendered else None
 
 
 def render_room(
@@ -111,6 +135,7 @@ def render_room(
     backend: backends.Backend | None = None,
     threads: int | None = None,
     say: Callable[[str], None] | None = None,
+    variation: Variation = PLAIN,
 ) -> Rendered:
     """Render every pose of a plan and write the scene, atomically; resumes a run that was stopped.
 
@@ -126,6 +151,7 @@ def render_room(
         threads: number of threads, which does not change the pictures; by default one per core, or one
             without LLVM.
         say: called with a line of text that names the variant.
+        variation: a change of the pictures; states, graph and poses of the file remain the plan's.
 
     Raises:
         SceneError: the plan has faults, furniture or a package is missing, or the file cannot be written.
@@ -140,26 +166,26 @@ def render_room(
     plan = plan.completed(catalogue)
     raise_faults(f"plan {plan.name!r}", plan_faults(plan))  # sizes from the catalogue may not fit the room
     room = poses(plan)
+    varied = vary_plan(plan, variation, catalogue)
     backend = backends.choose_backend() if backend is None else backend
     mi = backends.load_mitsuba(backend, threads)
     (say or (lambda line: None))(f"{plan.name}: {room.num_states} states, rendering with {backend}")
     report = progress or (lambda what, done, total: None)
     versions = {name: metadata.version(name) for name in ("mitsuba", "mitsuba-oidn")}
-    frames = Frames(plan, room, out, {"variant": backend.variant, **versions})
-    began = time.monotonic()
-    report("frames", frames.done, room.num_states)
-    if not frames.complete:
-        renderer = Renderer(mi, build_scene(mi, plan, catalogue), plan.camera)
-        began = time.monotonic()
-        frames.render(renderer.frame, lambda: report("frames", frames.done, room.num_states))
-    seconds = (time.monotonic() - began) / frames.rendered if frames.rendered else None
+    frames = Frames(plan, room, out, {"variant": backend.variant, **versions}, variation)
+    report("frames", frames.done, frames.total)
+
+    def renderer_of(plan: Plan) -> Renderer:
+        return Renderer(mi, build_scene(mi, plan, catalogue), plan.camera)
+
+    seconds = _render_frames(frames, plan, varied, renderer_of, report)
     scene = capture(
         out,
         plan.name,
         PoseGraph(room.graph, room.location, room.rotation, default_actions(4)),
         frames.read,
         _origin(plan, catalogue),
-        attributes=_attributes(plan, catalogue, backend, frames.exposure),
+        attributes=_attributes(varied, catalogue, backend, frames.exposure, variation),
         backbone=network,
         progress=lambda done, total: report("features", done, total),
     )

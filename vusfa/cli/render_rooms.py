@@ -1,0 +1,160 @@
+"""``vusfa scenes render-rooms``: many rooms, or many renderings of some, into a folder."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, NamedTuple
+
+import typer
+
+from vusfa.cli.render import Samples, Scalar, Threads, Weights, Width, find_plan, with_camera
+from vusfa.errors import ConfigError, VusfaError
+
+if TYPE_CHECKING:
+    from vusfa.sources.render.plan import Plan
+    from vusfa.sources.render.variation import Variation
+
+__all__ = ["register"]
+
+
+def register(scenes: typer.Typer) -> None:
+    """Add the command to ``vusfa scenes``."""
+    scenes.command("render-rooms")(render_rooms)
+
+
+class _Job(NamedTuple):
+    """A file to make."""
+
+    target: Path
+    draw: Callable[[], Plan]
+    variation: Variation
+
+
+def seed_numbers(words: list[str]) -> list[int]:
+    """Seeds of words such as "7" and "1-60".
+
+    Raises:
+        ConfigError: a word is neither.
+
+    >>> seed_numbers(["7", "1-3"])
+    [7, 1, 2, 3]
+    """
+    numbers: list[int] = []
+    for word in words:
+        first, dash, last = word.partition("-")
+        ends = [first, last] if dash else [first, first]
+        if not all(end.isascii() and end.isdigit() and len(end) < 10 for end in ends):
+            raise ConfigError(f"seeds: {word!r} is neither a number nor a range; write 7 or 1-60")
+        low, high = map(int, ends)
+        if not low <= high < low + 100_000:
+            raise ConfigError(f"seeds: {word!r} must go upward, over at most 100,000 seeds")
+        numbers += range(low, high + 1)
+    return numbers
+
+
+def _jobs(
+    folder: Path, plans: list[Path], kinds: list[str], seeds: list[int], cells: int | None, vary: list[str]
+) -> Iterator[_Job]:
+    from vusfa.sources.render.layout import layout
+    from vusfa.sources.render.variation import PLAIN, load_variation
+
+    changes = {Path(name).stem: load_variation(name) for name in vary} or {"": PLAIN}
+    drawn: dict[str, Callable[[], Plan]] = {}
+    for path in plans:
+        drawn[path.stem] = lambda path=path: find_plan(path)  # type: ignore[misc]
+    for seed in seeds:  # a stopped run has rooms of all kinds
+        for kind in kinds:
+            drawn[f"{kind}-{seed}"] = lambda kind=kind, seed=seed: layout(kind, seed, cells)  # type: ignore[misc]
+    for name, draw in drawn.items():
+        for change, variation in changes.items():
+            yield _Job(folder / change / f"{name}.h5", draw, variation)
+
+
+def render_rooms(
+    folder: Annotated[
+        Path, typer.Argument(help="Folder to fill; files that exist are kept.", show_default=False)
+    ],
+    plan: Annotated[
+        list[Path] | None, typer.Option(help="Plans: YAML files, or names of bundled rooms.")
+    ] = None,
+    kind: Annotated[
+        list[str] | None,
+        typer.Option(help="Kinds to draw rooms of: bathroom, bedroom, kitchen, living_room, hall."),
+    ] = None,
+    seeds: Annotated[
+        list[str] | None, typer.Option(help="Random seeds for each kind: 1-60, or [1,2,7].")
+    ] = None,
+    cells: Annotated[
+        int | None, typer.Option(help="Number of free places of drawn rooms; by default the kind's own.")
+    ] = None,
+    vary: Annotated[
+        list[str] | None,
+        typer.Option(help="Changes of the pictures, as for `vusfa scenes render`; each gets a folder."),
+    ] = None,
+    width: Width = None,
+    samples: Samples = None,
+    backbone: Annotated[
+        str, typer.Option(help="Network that computes the features; see `vusfa scenes encode --help`.")
+    ] = "efficientnet-lite0",
+    weights: Weights = None,
+    scalar: Scalar = False,
+    threads: Threads = None,
+) -> None:
+    """Render many rooms into a folder, as small files (`vusfa scenes compact`).
+
+    Files are FOLDER/KIND-SEED.h5 and FOLDER/PLAN.h5, with --vary FOLDER/CHANGE/KIND-SEED.h5. If stopped, it
+    resumes when the same command is given again; a room that cannot be rendered is reported at the end.
+
+    Examples:
+
+        vusfa scenes render-rooms rooms/small kind=[bathroom,hall] seeds=1-60 cells=20
+
+        vusfa scenes render-rooms robust plan=[bathroom,kitchen] vary=[dimmer,camera,all]
+    """
+    from vusfa.cli.progress import progress
+    from vusfa.files import check_folder
+
+    if bool(plan) == bool(kind):
+        raise ConfigError("say what to render: plan=[FILE,...], or kind=[KIND,...] with seeds=1-60")
+    if plan and (seeds or cells is not None):
+        raise ConfigError("seeds and cells belong to kind; a plan has both")
+    jobs = list(_jobs(folder, plan or [], kind or [], seed_numbers(seeds or ["1"]), cells, vary or []))
+    check_folder(folder.absolute(), "the folder of the rooms")
+    waiting = [job for job in jobs if not job.target.exists()]
+    if len(waiting) < len(jobs):
+        typer.echo(f"{len(jobs) - len(waiting)} of {len(jobs)} files are there already", err=True)
+    if not waiting:
+        return
+    from vusfa.sources.backbones import load_backbone
+    from vusfa.sources.compact import compact
+    from vusfa.sources.render.backend import Backend
+    from vusfa.sources.render.room import render_room
+
+    network = load_backbone(backbone, weights=weights)
+    failed: list[str] = []
+    with progress("rendering", len(waiting), "rooms") as advance:
+        for job in waiting:
+            job.target.parent.mkdir(parents=True, exist_ok=True)
+            raw = job.target.with_name(f".{job.target.name}.raw.h5")
+            try:
+                rendered = render_room(
+                    with_camera(job.draw(), width, samples),
+                    raw,
+                    backbone=network,
+                    backend=Backend("scalar_rgb") if scalar else None,
+                    threads=threads,
+                    variation=job.variation,
+                )
+                told = str(rendered).replace(str(raw), str(job.target))
+                typer.echo(told)
+                compact(raw, job.target)
+                raw.unlink()
+            except VusfaError as error:
+                failed.append(f"{job.target}: {error}")
+                typer.echo(f"error: {failed[-1]}", err=True)
+            advance()
+    if failed:
+        raise ConfigError(
+            f"{len(failed)} of {len(waiting)} rooms could not be rendered:\n  " + "\n  ".join(failed)
+        )
