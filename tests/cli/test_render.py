@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
-from vusfa.sources.render import Rendered, layout, load_plan, room, save_plan
+from vusfa.errors import SceneError
+from vusfa.scenes import Scene
+from vusfa.scenes.provenance import Provenance
+from vusfa.sources.capture import PoseGraph, capture
+from vusfa.sources.render import VARIATIONS, Rendered, Variation, layout, load_plan, room, save_plan
 from vusfa.sources.render.backend import Backend
 
 
@@ -80,3 +86,85 @@ def test_the_renderer_gets_the_plan_and_its_progress_is_told(
     assert "0.25 s per frame; 50.0 % of them look like another state" in result.stdout
     run("render", "--plan", tmp_path / "bath.yaml", "-o", tmp_path / "bath.h5", "--scalar")
     assert given["backend"] == Backend("scalar_rgb")
+    assert given["variation"] == Variation()
+    cheap = ["--width", 100, "--samples", 2, "--vary", "dimmer"]
+    assert run("render", "--plan", tmp_path / "bath.yaml", "-o", tmp_path / "bath.h5", *cheap).exit_code == 0
+    assert (given["plan"].camera.resolution, given["plan"].camera.samples) == ((100, 75), 2)
+    assert given["variation"] == VARIATIONS["dimmer"]
+
+
+@pytest.fixture
+def painted(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, Variation]]:
+    """Names and variations of rooms that were rendered; seed 2 is dark when it is rendered first."""
+    made: list[tuple[str, Variation]] = []
+
+    def render(plan: Any, out: Path, *, variation: Variation, **options: Any) -> Rendered:
+        made.append((f"{plan.name}-{plan.seed}", variation))
+        if plan.seed == 2 and sum(name == made[-1][0] for name, _ in made) == 1:
+            raise SceneError("the room is dark")
+        corridor = PoseGraph(np.array([[1], [0]]), np.array([[0, 0], [0, 1.0]]), np.zeros(2), ("forward",))
+        grey = np.full((2, 24, 32, 3), 128, np.uint8)
+        capture(out, plan.name, corridor, grey, Provenance(), features=np.eye(2)[:, None])
+        return Rendered(out, 2, "chalk", 0.25, 0.5)
+
+    monkeypatch.setattr(room, "render_room", render)
+    monkeypatch.setattr("vusfa.sources.backbones.load_backbone", lambda name, weights: (name, weights))
+    return made
+
+
+def test_many_rooms_fill_a_folder_and_a_second_run_does_the_rest(
+    run: Callable[..., Any], tmp_path: Path, painted: list[tuple[str, Variation]]
+) -> None:
+    words = ["render-rooms", tmp_path / "rooms", "kind=[bathroom]", "seeds=[1-2,5]", "cells=20"]
+    result = run(*words)
+    assert result.exit_code == 1
+    assert "1 of 3 rooms could not be rendered" in result.stderr
+    assert "bathroom-2.h5: the room is dark" in result.stderr
+    assert sorted(path.name for path in (tmp_path / "rooms").iterdir()) == ["bathroom-1.h5", "bathroom-5.h5"]
+    assert Scene.load(tmp_path / "rooms" / "bathroom-1.h5").num_states == 2
+    result = run(*words)
+    assert result.exit_code == 0, result.stderr
+    assert "2 of 3 files are there already" in result.stderr
+    assert [name for name, _ in painted] == [f"bathroom-{seed}" for seed in (1, 2, 5, 2)]
+
+
+def test_every_change_of_a_room_has_its_folder(
+    run: Callable[..., Any], tmp_path: Path, painted: list[tuple[str, Variation]]
+) -> None:
+    result = run("render-rooms", tmp_path, "plan=[bathroom,kitchen]", "vary=[dimmer,blur]")
+    assert result.exit_code == 0, result.stderr
+    files = sorted(str(path.relative_to(tmp_path)) for path in tmp_path.glob("*/*"))
+    assert files == [
+        f"{change}/{name}.h5" for change in ("blur", "dimmer") for name in ("bathroom", "kitchen")
+    ]
+    assert {variation for _, variation in painted} == {VARIATIONS["dimmer"], VARIATIONS["blur"]}
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ([], r"plan=\[FILE,...\], or kind="),
+        (["plan=[bathroom]", "kind=[hall]"], r"plan=\[FILE,...\], or kind="),
+        (["plan=[bathroom]", "seeds=1-2"], "seeds and cells belong to kind"),
+        (["kind=[hall]", "seeds=1-x"], "'1-x' is neither a number nor a range"),
+        (["kind=[hall]", "seeds=9-2"], "'9-2' must go upward"),
+        (["kind=[hall]", "seeds=0-999999999"], "at most 100,000 seeds"),
+        (["kind=[hall]", "vary=[darker]"], "darker: .* one of noise, brighter"),
+        (["kind=[attic]"], "no kind of room is called 'attic'"),
+        (["plan=[attic]"], "attic: cannot be read"),
+        (["plan=[bathroom,x/bathroom]"], "two plans have one name"),
+        (["kind=[hall]", "vary=[blur,blur]"], "two changes have one name"),
+    ],
+)
+def test_what_cannot_be_made_is_said_before_anything_is(
+    run: Callable[..., Any],
+    tmp_path: Path,
+    painted: list[tuple[str, Variation]],
+    words: list[str],
+    message: str,
+) -> None:
+    result = run("render-rooms", tmp_path / "rooms", *words)
+    assert result.exit_code == 1
+    assert re.search(message, result.stderr.replace("\n", " "))
+    assert not painted
+    assert not list(tmp_path.iterdir())

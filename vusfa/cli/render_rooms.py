@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, NamedTuple
 
@@ -10,6 +12,7 @@ import typer
 
 from vusfa.cli.render import Samples, Scalar, Threads, Weights, Width, find_plan, with_camera
 from vusfa.errors import ConfigError, VusfaError
+from vusfa.limits import brief
 
 if TYPE_CHECKING:
     from vusfa.sources.render.plan import Plan
@@ -53,19 +56,29 @@ def seed_numbers(words: list[str]) -> list[int]:
     return numbers
 
 
+def _given(plan: Plan) -> Plan:
+    return plan
+
+
 def _jobs(
     folder: Path, plans: list[Path], kinds: list[str], seeds: list[int], cells: int | None, vary: list[str]
 ) -> Iterator[_Job]:
+    from vusfa.sources.render.kinds import programme
     from vusfa.sources.render.layout import layout
     from vusfa.sources.render.variation import PLAIN, load_variation
 
+    for what, paths in (("plans", plans), ("changes", [Path(name) for name in vary])):
+        if len({path.stem for path in paths}) < len(paths):
+            raise ConfigError(f"two {what} have one name among {brief([str(path) for path in paths])}")
     changes = {Path(name).stem: load_variation(name) for name in vary} or {"": PLAIN}
     drawn: dict[str, Callable[[], Plan]] = {}
     for path in plans:
-        drawn[path.stem] = lambda path=path: find_plan(path)  # type: ignore[misc]
+        drawn[path.stem] = partial(_given, find_plan(path))
+    for kind in kinds:
+        programme(kind)  # an unknown kind is an error before any work
     for seed in seeds:  # a stopped run has rooms of all kinds
         for kind in kinds:
-            drawn[f"{kind}-{seed}"] = lambda kind=kind, seed=seed: layout(kind, seed, cells)  # type: ignore[misc]
+            drawn[f"{kind}-{seed}"] = partial(layout, kind, seed, cells)
     for name, draw in drawn.items():
         for change, variation in changes.items():
             yield _Job(folder / change / f"{name}.h5", draw, variation)
@@ -101,7 +114,7 @@ def render_rooms(
     scalar: Scalar = False,
     threads: Threads = None,
 ) -> None:
-    """Render many rooms into a folder, as small files (`vusfa scenes compact`).
+    """Render many rooms into a folder, as small files (see `vusfa scenes compact`).
 
     Files are FOLDER/KIND-SEED.h5 and FOLDER/PLAN.h5, with --vary FOLDER/CHANGE/KIND-SEED.h5. If stopped, it
     resumes when the same command is given again; a room that cannot be rendered is reported at the end.
@@ -120,7 +133,6 @@ def render_rooms(
     if plan and (seeds or cells is not None):
         raise ConfigError("seeds and cells belong to kind; a plan has both")
     jobs = list(_jobs(folder, plan or [], kind or [], seed_numbers(seeds or ["1"]), cells, vary or []))
-    check_folder(folder.absolute(), "the folder of the rooms")
     waiting = [job for job in jobs if not job.target.exists()]
     if len(waiting) < len(jobs):
         typer.echo(f"{len(jobs) - len(waiting)} of {len(jobs)} files are there already", err=True)
@@ -132,6 +144,7 @@ def render_rooms(
     from vusfa.sources.render.room import render_room
 
     network = load_backbone(backbone, weights=weights)
+    check_folder(folder.absolute(), "the folder of the rooms")
     failed: list[str] = []
     with progress("rendering", len(waiting), "rooms") as advance:
         for job in waiting:
@@ -146,10 +159,9 @@ def render_rooms(
                     threads=threads,
                     variation=job.variation,
                 )
-                told = str(rendered).replace(str(raw), str(job.target))
-                typer.echo(told)
                 compact(raw, job.target)
                 raw.unlink()
+                typer.echo(str(replace(rendered, path=job.target)))
             except VusfaError as error:
                 failed.append(f"{job.target}: {error}")
                 typer.echo(f"error: {failed[-1]}", err=True)

@@ -17,7 +17,7 @@ from vusfa.errors import ConfigError, SceneError
 from vusfa.scenes import Scene, validate
 from vusfa.scenes.provenance import Provenance
 from vusfa.sources.backbones import Backbone, load_backbone
-from vusfa.sources.render import Catalogue, from_yaml, load_plan, poses, render_room, to_yaml
+from vusfa.sources.render import Catalogue, Variation, from_yaml, load_plan, poses, render_room, to_yaml
 from vusfa.sources.render.backend import Backend, choose_backend, cores, load_mitsuba
 from vusfa.sources.render.geometry import build_scene
 from vusfa.sources.render.renderer import Renderer, tone_map
@@ -123,6 +123,38 @@ def test_the_scalar_variant_shows_the_same_room() -> None:
         pictures.append(tone_map(renderer.frame(0.3, 0.3, 90.0, 0), 2.0).astype(int))
     assert np.abs(pictures[0] - pictures[1]).mean() < 5
     assert np.abs(pictures[0] - pictures[1].mean(axis=(0, 1))).mean() > 16
+
+
+@pytest.mark.usefixtures("needs_llvm")
+def test_a_replayed_frame_is_the_one_that_is_traced_anew() -> None:
+    catalogue = Catalogue.open()
+    plan = TINY.completed(catalogue)
+    mi = load_mitsuba(choose_backend())
+    scene = build_scene(mi, plan, catalogue)
+    replaying = Renderer(mi, scene, plan.camera)
+    for state, heading in enumerate((0.0, 90.0, 180.0, 270.0)):
+        pose = (0.3 + 0.1 * state, 0.3, heading, state)
+        np.testing.assert_array_equal(
+            replaying.frame(*pose), Renderer(mi, scene, plan.camera).frame(*pose), err_msg=str(state)
+        )
+
+
+def test_a_change_leaves_the_states_and_is_written_down(tmp_path: Path, network: Backbone) -> None:
+    plan = replace(TINY, camera=replace(TINY.camera, resolution=(24, 18)))
+    changes = {"plain": Variation(), "dark": Variation(lamps=0.25, offset=0.1)}
+    rooms = []
+    for name, variation in changes.items():
+        render_room(plan, tmp_path / f"{name}.h5", backbone=network, variation=variation)
+        rooms.append(Scene.load(tmp_path / f"{name}.h5"))
+    plain, dark = rooms
+    for name in ("graph", "location", "rotation"):
+        np.testing.assert_array_equal(getattr(plain, name).numpy(), getattr(dark, name).numpy())
+    assert dark.name == plain.name
+    assert dark.attributes["exposure"] == plain.attributes["exposure"]
+    assert dark.attributes["variation"] == "{lamps: 0.25, offset: 0.1}"
+    assert "variation" not in plain.attributes
+    assert dark.attributes["plan"] == plain.attributes["plan"]
+    assert dark.pictures(range(8)).numpy().mean() < plain.pictures(range(8)).numpy().mean() - 10
 
 
 def test_the_bundled_bathroom_comes_out_of_its_plan_again() -> None:

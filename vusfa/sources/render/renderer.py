@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -83,11 +84,26 @@ class Renderer:
             }
         )
         self._values = mi.traverse(self._sensor)
-        self._integrator = scene.integrator()
+        integrator = scene.integrator()
+
+        def layers(scene: Any, sensor: Any, seed: Any) -> Any:
+            # mi.render would turn Ctrl-C into a RuntimeError.
+            return integrator.render(scene, sensor, seed=seed, spp=camera.samples, evaluate=False)
+
+        self._layers: Callable[[Any, Any, Any], Any] = layers
+        self._recorded = mi.variant() == "scalar_rgb"  # which compiles nothing
 
     def _pose(self, x: float, z: float, heading: float) -> Any:
         origin, target = look_at(x, z, heading, self._camera)
         return self._mi.ScalarTransform4f().look_at(origin=origin, target=target, up=[0, 1, 0])
+
+    def _opaque(self, seed: int) -> Any:
+        """The seed as a variable: a literal would be part of the program."""
+        if self._mi.variant() == "scalar_rgb":
+            return seed
+        import drjit
+
+        return drjit.opaque(self._mi.UInt32, seed)
 
     def frame(self, x: float, z: float, heading: float, seed: int) -> np.ndarray:
         """View from a pose, (H, W, 3) linear float32; the same seed gives the same noise."""
@@ -95,11 +111,13 @@ class Renderer:
 
         self._values["to_world"] = self._pose(x, z, heading)
         self._values.update()
-        # mi.render would turn Ctrl-C into a RuntimeError.
-        samples = self._camera.samples
-        layers = np.array(
-            self._integrator.render(self._scene, self._sensor, seed=seed, spp=samples, evaluate=False)
-        )
+        layers = np.array(self._layers(self._scene, self._sensor, self._opaque(seed)))
+        if not self._recorded:
+            import drjit
+
+            # All frames are one program, traced once and replayed with the pose and the seed of each. The
+            # first frame builds what a recording must find in the scene.
+            self._layers, self._recorded = drjit.freeze(self._layers), True
         color, normal, albedo = (
             np.ascontiguousarray(layer, np.float32)
             for layer in (layers[..., :3], layers[..., -6:-3], np.clip(layers[..., -3:], 0, 1))

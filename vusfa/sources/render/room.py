@@ -102,7 +102,11 @@ def _attributes(
         "hfov_deg": plan.camera.fov,
         "spp": plan.camera.samples,
         "frame": "location=(X right, Z forward); heading 0 = +Z, 90 = +X; RotateRight turns clockwise",
-        **({"variation": yaml.safe_dump(changes, default_flow_style=True).strip()} if changes else {}),
+        **(
+            {"variation": yaml.safe_dump(changes, default_flow_style=True, width=400).strip()}
+            if changes
+            else {}
+        ),
     }
 
 
