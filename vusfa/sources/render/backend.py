@@ -1,4 +1,4 @@
-"""Which of Mitsuba's variants to render with: LLVM where one is found that works, otherwise plain C++.
+"""Choice of Mitsuba's variant: LLVM if a working library is found, otherwise scalar C++.
 
 LLVM is several times faster, but some versions of it crash (LLVM 15 does with Mitsuba 3.9), so each candidate
 first renders a small scene in a process of its own. ``DRJIT_LIBLLVM_PATH`` names one to try first. The scalar
@@ -56,7 +56,7 @@ class Backend:
 
 
 def _version(path: str) -> int:
-    """LLVM's major version by a file's name or folder; 0 where neither tells.
+    """Major version of LLVM according to a file's name or folder; 0 if neither tells.
 
     >>> _version("/usr/lib/x86_64-linux-gnu/libLLVM.so.19.1"), _version("/usr/lib/llvm-16/lib/libLLVM.so")
     (19, 16)
@@ -66,7 +66,7 @@ def _version(path: str) -> int:
 
 
 def llvm_libraries() -> list[str]:
-    """LLVM libraries on this machine, the newest first; a file with several names counts once."""
+    """Find the LLVM libraries of this machine, newest first; a file with several names counts once."""
     found: dict[str, int] = {}
     for pattern in _PATTERNS:
         for path in glob.glob(pattern):
@@ -78,7 +78,7 @@ def llvm_libraries() -> list[str]:
 
 
 def works(library: str) -> bool:
-    """Whether Mitsuba renders with an LLVM, tried in a process of its own that may crash."""
+    """Whether Mitsuba renders with an LLVM library; a separate process tries, since it may crash."""
     try:
         done = subprocess.run(
             [sys.executable, "-c", _TRIAL],
@@ -102,11 +102,11 @@ def choose_backend() -> Backend:
 
 
 def load_mitsuba(backend: Backend, threads: int | None = None) -> Any:
-    """The module ``mitsuba``, set to a variant.
+    """Import the module ``mitsuba`` and set its variant.
 
     Args:
         backend: the variant.
-        threads: how many threads render and denoise, in the whole process; when None one for each core, and
+        threads: number of threads that render and denoise in the whole process; by default one per core, or
             one for the scalar variant.
 
     Raises:

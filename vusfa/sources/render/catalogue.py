@@ -45,7 +45,7 @@ _PROPERTIES = "PluginFurnitureCatalog.properties"
 
 @dataclass(frozen=True, eq=False)
 class Model:
-    """One entry of the catalogue; lengths in metres.
+    """An entry of the catalogue; lengths in metres.
 
     Args:
         name: ``COLLECTION#NUMBER``.
@@ -69,33 +69,33 @@ class Model:
 
     @property
     def collection(self) -> str:
-        """The collection that it is from."""
+        """Name of its collection."""
         return self.name.partition("#")[0]
 
     @property
     def width(self) -> float:
-        """Along the wall that it stands at."""
+        """Length along its wall, in metres."""
         return self.size[0]
 
     @property
     def height(self) -> float:
-        """From its underside."""
+        """Height above its underside, in metres."""
         return self.size[1]
 
     @property
     def depth(self) -> float:
-        """From the wall that it stands at."""
+        """Length away from its wall, in metres."""
         return self.size[2]
 
     @property
     def exact_size(self) -> tuple[float, float, float]:
-        """Its size as plans have it, without the division's rounding errors."""
+        """Size as written in plans: rounded to a micrometre, without the errors of a division."""
         width, height, depth = (round(length, 6) for length in self.size)
         return width, height, depth
 
     @property
     def credit(self) -> str:
-        """Name, title, author and licence in one line, as licences ask for.
+        """Name, title, author and licence in one line, as the licences require.
 
         >>> Catalogue.bundled()["Scopia#5"].credit.split(", https")[0]
         'Scopia#5 Wardrobe, by Scopia (CC BY 3.0'
@@ -105,10 +105,10 @@ class Model:
 
 
 class Archive:
-    """The files of one library, an ``.sh3f`` archive or the folder that it was unpacked into.
+    """The files of a library: an ``.sh3f`` archive, or the folder with its unpacked content.
 
     Args:
-        path: of either.
+        path: the archive or the folder.
     """
 
     def __init__(self, path: Path) -> None:
@@ -133,7 +133,7 @@ class Archive:
         return name.lower() in self._names
 
     def read(self, name: str) -> bytes:
-        """A file's bytes; upper and lower case are the same, as the libraries themselves assume."""
+        """Read a file; names are not case-sensitive, as the libraries assume."""
         try:
             found = self._names[name.lower()]
             return (self.path / found).read_bytes() if self._zip is None else self._zip.read(found)
@@ -141,7 +141,7 @@ class Archive:
             raise SceneError(f"{self.path}: cannot give {name!r} ({error}); install it again") from error
 
     def folder(self, name: str) -> list[str]:
-        """The files that lie in a folder, by their names there, in lower case."""
+        """List the names of the files in a folder, in lower case."""
         prefix = f"{name.lower().rstrip('/')}/"
         rest = (entry[len(prefix) :] for entry in self._names if entry.startswith(prefix))
         return sorted(entry for entry in rest if "/" not in entry)
@@ -201,8 +201,8 @@ class Catalogue(Mapping[str, Model]):
 
     Args:
         models: all of them.
-        archives: where their files are, by collection; empty when only sizes are known.
-        source: what errors call the catalogue.
+        archives: the libraries with their files by collection; empty if only sizes are known.
+        source: name of the catalogue in errors.
     """
 
     def __init__(
@@ -230,7 +230,7 @@ class Catalogue(Mapping[str, Model]):
 
     @classmethod
     def open(cls, folder: str | os.PathLike[str] | None = None) -> Catalogue:
-        """The furniture libraries of a folder, by default :func:`furniture_folder`.
+        """Open the furniture libraries of a folder, by default :func:`furniture_folder`.
 
         Raises:
             SceneError: there is no furniture, or a library is damaged.
@@ -255,7 +255,7 @@ class Catalogue(Mapping[str, Model]):
 
     @classmethod
     def bundled(cls) -> Catalogue:
-        """Sizes, titles and authors of the models that layouts draw from; without their files.
+        """Sizes, titles and authors of the models that layouts use, without their files.
 
         >>> Catalogue.bundled()["BlendSwap-CC-BY#3"].title
         'Bath'
@@ -263,7 +263,7 @@ class Catalogue(Mapping[str, Model]):
         return _bundled()
 
     def archive(self, model: Model) -> Archive:
-        """The library that has a model's file.
+        """Find the library that holds a model's file.
 
         Raises:
             SceneError: only the model's size is known.

@@ -1,6 +1,6 @@
-"""Pictures, windows and things that hang, so that no two walls look alike.
+"""Decoration of walls with pictures, windows and hung furniture, so that no two walls look alike.
 
-Each wall is walked along from left to right; whatever is drawn goes where no tall furniture hides it.
+Each wall is filled from left to right, where no tall furniture would hide the decoration.
 """
 
 from __future__ import annotations
@@ -79,7 +79,7 @@ def _picture(draft: Draft, wall: Wall, t: float) -> float:
 
 
 def decorate(draft: Draft, programme: Programme, view_seed: int) -> None:
-    """Cover a furnished draft's walls.
+    """Decorate the walls of a furnished draft.
 
     Args:
         draft: the room; its furniture is not moved.
@@ -96,6 +96,6 @@ def decorate(draft: Draft, programme: Programme, view_seed: int) -> None:
                 done = _window(draft, wall, t, view_seed + len(draft.spans))
             elif chance < 0.36:
                 done = _hung(draft, programme, wall, t)
-            # What found no place here makes way for a picture, which may be smaller.
+            # Where a window or a hung piece does not fit, a picture may.
             done = done or _picture(draft, wall, t)
             t += done + rng.uniform(0.12, 0.5) if done else 0.15

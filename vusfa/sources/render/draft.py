@@ -1,7 +1,7 @@
-"""A room while it is being furnished: where things stand, and where more would fit.
+"""Draft of a room while it is being furnished: what stands where, and what else fits.
 
-All chance comes from the draft's own ``random.Random``, whose stream Python keeps the same from version to
-version.
+All random numbers come from the draft's own ``random.Random``, whose stream is the same in every version of
+Python.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ _HEADINGS = ((0, 1), (1, 0), (0, -1), (-1, 0))
 
 @dataclass(frozen=True, eq=False)
 class Placed:
-    """A model in its place, with its catalogue entry at hand."""
+    """A model at its place, with its entry of the catalogue."""
 
     model: Model
     x: float
@@ -39,7 +39,7 @@ class Placed:
         return footprint(self.x, self.z, self.model.width, self.model.depth, self.facing)
 
     def furniture(self) -> Furniture:
-        """As a plan has it, to a tenth of a millimetre."""
+        """Convert to an entry of a plan, rounded to a tenth of a millimetre."""
         at = (round(self.x, 4), round(self.z, 4))
         elevation = round(self.elevation, 4)
         return Furniture(
@@ -49,14 +49,14 @@ class Placed:
 
 @dataclass(frozen=True)
 class Span:
-    """A part of a wall that something takes: ``width`` / 2 to either side of ``middle``."""
+    """An occupied part of a wall: ``width`` / 2 to either side of ``middle``."""
 
     wall: Wall
     middle: float
     width: float
 
     def meets(self, wall: Wall, a: float, b: float, margin: float = 0.04) -> bool:
-        """Whether it comes nearer than ``margin`` to the part a..b of a wall."""
+        """Whether it is nearer than ``margin`` to the part a..b of a wall."""
         low, high = self.middle - self.width / 2, self.middle + self.width / 2
         return self.wall == wall and low < b + margin and a - margin < high
 
@@ -72,16 +72,16 @@ def facing_of(normal: tuple[int, int]) -> float:
 
 @dataclass
 class Draft:
-    """A rectangle (0, 0)-(width, depth) without solid blocks, and what has been put into it.
+    """A room, the rectangle (0, 0) to (width, depth) without its solid blocks, and its furniture so far.
 
     Args:
         width: metres along X.
         depth: metres along Z.
         solids: blocks of wall.
         catalogue: sizes of models.
-        rng: the source of all chance.
+        rng: generator of all random numbers.
         reserved: rectangles that stay free, such as those in front of doors.
-        spans: parts of walls that are taken.
+        spans: occupied parts of walls.
     """
 
     width: float
@@ -106,7 +106,7 @@ class Draft:
         return [*self.solids, *(item.rect for item in (*self.items, *self.fixtures) if item.blocks)]
 
     def inside(self, rect: Rect) -> bool:
-        """Whether a rectangle lies in the room's."""
+        """Whether a rectangle lies within the room's rectangle."""
         edge = 1e-6
         return (
             rect[0] >= -edge
@@ -116,20 +116,20 @@ class Draft:
         )
 
     def fits(self, rect: Rect, margin: float) -> bool:
-        """Whether a rectangle lies in the room, clear of walls, and by a margin of all that is in its way."""
+        """Whether a rectangle lies in the room, clear of walls, and ``margin`` metres from all obstacles."""
         if not self.inside(rect) or any(overlaps(rect, solid, 1e-4) for solid in self.solids):
             return False
         others = [*(item.rect for item in self.items if item.blocks), *self.reserved]
         return not any(overlaps(rect, other, margin) for other in others)
 
     def pick(self, pool: Sequence[str]) -> Model:
-        """One of a pool, of those not used yet while there are any."""
+        """Draw a model from a pool; unused ones first."""
         chosen = self.rng.choice([name for name in pool if name not in self.used] or pool)
         self.used.add(chosen)
         return self.catalogue[chosen]
 
     def put(self, model: Model, x: float, z: float, normal: tuple[int, int], margin: float) -> Placed | None:
-        """Stand a model on the floor, its front to ``normal``; None where it does not fit."""
+        """Stand a model on the floor, its front towards ``normal``; None if it does not fit."""
         item = Placed(model, x, z, facing_of(normal), model.elevation, "floor", True)
         if not self.fits(item.rect, margin):
             return None
@@ -137,11 +137,11 @@ class Draft:
         return item
 
     def lay(self, model: Model, x: float, z: float, facing: float, elevation: float, role: str) -> None:
-        """Put something where it is in nobody's way: a rug, a lamp, a thing on a table."""
+        """Put something that blocks no way: a rug, a lamp, an object on a table."""
         self.items.append(Placed(model, x, z, facing, elevation, role, False))
 
     def put_along_wall(self, model: Model, tries: int = 80) -> None:
-        """Stand a model at some wall, often in a corner; given up after some tries."""
+        """Stand a model at a random wall, often in a corner; leave it out after ``tries`` failures."""
         for _ in range(tries):
             wall = self.rng.choices(self.walls, [wall.length for wall in self.walls])[0]
             if wall.length < model.width + 0.05:
@@ -153,7 +153,7 @@ class Draft:
                 return
 
     def put_free(self, model: Model, margin: float = 0.55, tries: int = 120) -> Placed | None:
-        """Stand a model in the middle, one can walk around it; None after some tries."""
+        """Stand a model free of walls, with a way around it; None after ``tries`` failures."""
         for _ in range(tries):
             x, z = self.rng.uniform(0.8, self.width - 0.8), self.rng.uniform(0.8, self.depth - 0.8)
             item = self.put(model, x, z, self.rng.choice(_HEADINGS), margin)
@@ -162,7 +162,7 @@ class Draft:
         return None
 
     def put_table(self, table: Model, chair: Model, chairs: int) -> None:
-        """Stand a table in the middle with chairs at some of its sides."""
+        """Stand a table free of walls, with chairs at some of its sides."""
         placed = self.put_free(table, 0.75)
         if placed is None:
             return

@@ -1,8 +1,8 @@
 """Flats: two to five rooms side by side, joined by doorways, as one scene.
 
-Each room is drawn and furnished by itself with the floor before its doorways kept free, then moved to its
-place in the row. The walls between them are as thick as puts all rooms on one grid, so that one place lies
-in each doorway.
+Each room is drawn and furnished separately, with free floor in front of its doorways, then moved to its
+place in the row. The thickness of the walls between rooms puts all of them on one grid, with one place in
+each doorway.
 """
 
 from __future__ import annotations
@@ -68,7 +68,7 @@ def _at_doorway(wall: Wall, row: int, on_left: bool) -> float | None:
 
 
 def _draw_room(slot: _Slot, seed: int, number: int, catalogue: Catalogue) -> Draft:
-    """The best of some drafts: as many free places as can be, none cut off, none of its doorways blocked."""
+    """Draw several drafts and keep the best: as many free places as wanted, no doorway cut off."""
     best: tuple[float, Draft] | None = None
     width, depth = room_size(slot.programme.grid)
     for attempt in range(_ATTEMPTS):
@@ -106,8 +106,8 @@ def flat(
     Args:
         kinds: of its rooms, from left to right; two to five, repeats allowed.
         seed: any whole number.
-        cells: about how many free places all rooms shall have together; the kinds' own when left out.
-        catalogue: sizes of the models; the package's table when left out.
+        cells: approximate number of free places of all rooms together; by default the kinds' own.
+        catalogue: sizes of the models; by default the package's table.
 
     Raises:
         SceneError: there are too few or too many rooms, a kind is not known, or ``cells`` is too small.

@@ -1,7 +1,7 @@
-"""Frames of a room, saved one by one, so that rendering can be stopped at any moment.
+"""Frames of a room, saved one by one, so that rendering can be stopped and resumed at any time.
 
-The exposure is measured from some frames of all over the room as the plan has it, which are rendered first
-and kept as they are: resumed or not, the pictures come out the same.
+The exposure is measured from a few frames of the unvaried room, which are rendered first and kept: a resumed
+run gives the same pictures.
 """
 
 from __future__ import annotations
@@ -29,13 +29,13 @@ FrameOf = Callable[[float, float, float, int], np.ndarray]
 
 
 class Frames:
-    """All frames of a room, in two hidden logs beside the product.
+    """All frames of a room, in two hidden logs beside the scene file.
 
     Args:
         plan: the room.
         room: its poses.
-        path: the product.
-        work: what else the frames depend on, such as versions; other frames that lie there are thrown away.
+        path: the scene file.
+        work: what else the frames depend on, such as versions; logs of other work are discarded.
         variation: the change of the pictures; the exposure is that of the room without it.
     """
 
@@ -53,7 +53,7 @@ class Frames:
         shape = (height, width, 3)
         order = random_stream(plan.surfaces.seed).permutation(room.num_states)
         self._probed = [int(state) for state in order[:_PROBES]] if plan.camera.exposure is None else []
-        # Frames to measure the exposure by that are frames of the product, too.
+        # Frames for the exposure that are also frames of the scene.
         self._shared = set() if variation.changes() else set(self._probed)
         self._given = plan.camera.exposure
         described = {"plan": to_yaml(plan), **work, **variation.changes()}
@@ -88,7 +88,7 @@ class Frames:
 
     @property
     def exposure(self) -> float:
-        """The plan's, or else what the first frames say; these must be there.
+        """The plan's exposure, or the measured one; requires :attr:`measured`.
 
         Raises:
             SceneError: the room is dark.
@@ -96,7 +96,7 @@ class Frames:
         return exposure_of(self._probes.read()) if self._given is None else self._given
 
     def measure(self, frame: FrameOf, report: Callable[[], None]) -> None:
-        """Render the missing frames that the exposure is measured by.
+        """Render the missing frames that measure the exposure.
 
         Args:
             frame: renders a frame of the room without the variation.

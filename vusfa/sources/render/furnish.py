@@ -1,4 +1,4 @@
-"""Furniture for a draft, what needs most room first: doors, tables, along walls, free, small things."""
+"""Furnishing of a draft, largest pieces first: doors, tables, along walls, free-standing, small objects."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _HOLDS_THINGS = re.compile("able|abinet|esk|sland|Chest|Dresser|ashing|Dryer|fre
 
 
 def reserve(draft: Draft, wall: Wall, t: float, width: float) -> None:
-    """Keep the floor in front of a part of a wall free, and the wall there too."""
+    """Keep a part of a wall and the floor in front of it free."""
     x, z = wall.point(t)
     half = (abs(wall.along[0]) * width / 2, abs(wall.along[1]) * width / 2)
     low, high = (x - half[0], z - half[1]), (x + half[0], z + half[1])
@@ -32,7 +32,7 @@ def reserve(draft: Draft, wall: Wall, t: float, width: float) -> None:
 
 
 def put_door(draft: Draft, wall: Wall) -> None:
-    """A door somewhere in a wall, with free floor in front of it."""
+    """Put a door into a wall at random, with free floor in front of it."""
     model = draft.catalogue[draft.rng.choice(DOORS)]
     t = draft.rng.uniform(0.25 + model.width / 2, wall.length - 0.25 - model.width / 2)
     draft.fixtures.append(Placed(model, *wall.point(t), wall.facing, 0.0, "door", False))
@@ -51,12 +51,12 @@ def _put_small_things(draft: Draft, programme: Programme) -> None:
 
 
 def furnish(draft: Draft, programme: Programme, doors: int = 2, share: float = 1.0) -> None:
-    """Put a programme's furniture into a draft; what finds no place after some tries is left out.
+    """Put a programme's furniture into a draft; pieces that fit nowhere after some tries are left out.
 
     Args:
         draft: an empty room.
-        programme: what to draw from.
-        doors: how many, each in a wall of its own.
+        programme: the furniture to draw from.
+        doors: number of doors, each in another wall.
         share: of the programme's furniture; 2 for a room twice as large.
     """
     rng = draft.rng
@@ -81,7 +81,7 @@ def furnish(draft: Draft, programme: Programme, doors: int = 2, share: float = 1
         rug = draft.catalogue[name]
         x = rng.uniform(rug.width / 2, draft.width - rug.width / 2)
         z = rng.uniform(rug.depth / 2, draft.depth - rug.depth / 2)
-        # Each a little higher than the last, so that rugs that overlap do not flicker.
+        # Each slightly higher than the last, so that overlapping rugs do not flicker.
         draft.lay(rug, x, z, 0.0, 0.003 + 0.002 * len(draft.items) / 50, "rug")
     lamp = draft.catalogue[rng.choice(LAMPS)]
     x, z = draft.width * rng.uniform(0.35, 0.65), draft.depth * rng.uniform(0.35, 0.65)

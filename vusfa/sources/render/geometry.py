@@ -1,4 +1,4 @@
-"""A plan as a scene of Mitsuba: shell, furniture, pictures, windows, lamps.
+"""Conversion of a plan to a Mitsuba scene: shell, furniture, pictures, windows, lamps.
 
 Mitsuba's frame is right-handed with y up: its x is the plan's -X, its z the plan's Z.
 """
@@ -136,7 +136,7 @@ def _facing_normal(facing: float) -> tuple[float, float]:
 
 
 def build_scene(mi: Any, plan: Plan, catalogue: Catalogue) -> Any:
-    """Load everything that a plan names into Mitsuba.
+    """Load a plan into Mitsuba.
 
     Args:
         mi: the module ``mitsuba`` with its variant set.
@@ -189,5 +189,5 @@ def build_scene(mi: Any, plan: Plan, catalogue: Catalogue) -> Any:
             view(window.view, width, height),
             window.daylight,
         )
-    # Optimised, shapes and lights would come in another order each time, and with them other noise.
+    # Optimisation would reorder shapes and lights on every run, which changes the noise.
     return mi.load_dict(builder.shapes, optimize=False)

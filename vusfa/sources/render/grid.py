@@ -1,4 +1,4 @@
-"""Poses and moves in a room: which places of its grid are free, which are joined, and the graph of states.
+"""Poses and moves in a room: the free places of its grid, the moves between them, the graph of states.
 
 State = headings * place + heading, places sorted by column and row; actions MoveForward, RotateRight,
 RotateLeft, MoveBackward. Only the largest connected set of places is kept, so that every state reaches every
@@ -22,7 +22,7 @@ from vusfa.sources.render.plan import Grid, Plan
 __all__ = ["Poses", "free_cells", "is_free", "poses"]
 
 Cell = tuple[int, int]
-# Between two places the body is tried at these shares of the way.
+# Shares of the way between two places where the body must be free, too.
 _ON_THE_WAY = (0.25, 0.5, 0.75)
 
 
@@ -53,7 +53,7 @@ class Poses:
 def is_free(
     x: np.ndarray, z: np.ndarray, size: Sequence[float], obstacles: Sequence[Rect], radius: float
 ) -> np.ndarray:
-    """Where a round body of some radius clears the walls of a rectangle and all obstacles.
+    """Whether a round body clears the walls of a rectangle and all obstacles, for many places.
 
     Args:
         x: metres, any shape.
@@ -80,14 +80,14 @@ def is_free(
 def _steps(headings: int) -> list[Cell]:
     """The step forward of each heading, in places; heading 0 along +Z, then clockwise."""
     turns = [2 * math.pi * k / headings for k in range(headings)]
-    # 1.2: the sine of 45 degrees shall become 1, too
+    # 1.2 rounds the sine of 45 degrees up to 1
     return [(round(1.2 * math.sin(turn)), round(1.2 * math.cos(turn))) for turn in turns]
 
 
 def free_cells(
     shape: Cell, size: Sequence[float], obstacles: Sequence[Rect], grid: Grid
 ) -> tuple[list[Cell], set[tuple[Cell, Cell]], int]:
-    """The largest connected set of free places.
+    """Find the largest connected set of free places.
 
     Args:
         shape: places along X and Z, free or not.
@@ -135,7 +135,7 @@ def free_cells(
 
 
 def poses(plan: Plan) -> Poses:
-    """All states of a plan whose furniture has sizes (:meth:`Plan.completed`).
+    """Make all states of a plan whose furniture has sizes (:meth:`Plan.completed`).
 
     Raises:
         SceneError: no place is free.

@@ -1,7 +1,7 @@
-"""What belongs into which kind of room: size, outline, furniture.
+"""Kinds of rooms: their size, outline and furniture.
 
-Models are named in short: a letter for the collection and the number there (``S5`` is ``Scopia#5``). Where
-several are named one of them is drawn.
+Models have short names: a letter for the collection and a number (``S5`` is ``Scopia#5``). From a list of
+several, one is drawn.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ _Pool = tuple[str, ...]
 
 
 def model_name(short: str) -> str:
-    """The catalogue's name of a model.
+    """Expand a short name to the catalogue's.
 
     >>> model_name("S5")
     'Scopia#5'

@@ -1,7 +1,7 @@
 """Rooms drawn from a kind and a seed: the same arguments always give the same plan.
 
-Many drafts are drawn and furnished; the one whose number of free places comes nearest to ``cells``, with
-the fewest places cut off and enough furniture, becomes the plan.
+Many drafts are drawn and furnished. The plan is the draft whose number of free places is nearest to
+``cells``, with the fewest places cut off and enough furniture.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ _FEWEST_CELLS = 12
 
 
 def room_seed(kind: str, seed: int) -> int:
-    """The seed of a room's textures and views: different for each kind.
+    """Random seed of a room's textures and views, different for each kind.
 
     >>> room_seed("hall", 1)
     417001
@@ -42,7 +42,7 @@ def room_seed(kind: str, seed: int) -> int:
 
 
 def scaled(kind: str, cells: int | None, roomier: float = 1.0) -> tuple[Programme, float]:
-    """A kind's programme for some number of free places, and the share of furniture that belongs to it.
+    """Scale a kind's programme to a number of free places; also gives the share of its furniture.
 
     Args:
         kind: of room.
@@ -75,7 +75,7 @@ def scaled(kind: str, cells: int | None, roomier: float = 1.0) -> tuple[Programm
 
 
 def room_size(grid: tuple[int, int]) -> tuple[float, float]:
-    """Width and depth in metres of a room with so many places along X and Z.
+    """Width and depth in metres of a room, from its numbers of places along X and Z.
 
     >>> room_size((3, 2))
     (1.6, 1.1)
@@ -123,7 +123,7 @@ def _attempt(
 
 
 def best_lamps(places: np.ndarray, solids: list[Rect]) -> list[int]:
-    """Above which one or two places (two in rooms of more than 60) lamps light all of them best.
+    """Choose the places below the lamps: one, or two for more than 60 places, that light all places best.
 
     A lamp gives a place light by the inverse square of their distance (+ 2 m^2, as it hangs high), and a
     twentieth of that where a solid block is between them; the geometric mean over all places is maximised.
@@ -166,7 +166,7 @@ def as_plan(
     draft: Draft, name: str, kind: str, seed: int, surfaces: Surfaces, cells: list[tuple[int, int]]
 ) -> Plan:
     """A finished draft as a plan, lamps put up."""
-    # Not rounded: a wall's number of pixels, and so all colors drawn after it, hang on the last digit.
+    # Not rounded: the last digit decides a wall's number of pixels, and all colors drawn after it.
     solids = tuple(Solid(tuple(float(edge) for edge in rect)) for rect in draft.solids)  # type: ignore[arg-type]
     return Plan(
         name=name,
@@ -188,9 +188,9 @@ def layout(kind: str, seed: int = 1, cells: int | None = None, catalogue: Catalo
     Args:
         kind: bathroom, bedroom, kitchen, living_room or hall.
         seed: any whole number.
-        cells: number of free places, of half a metre; the kind's own when left out. The plan comes as
-            near as chance has it, mostly within two.
-        catalogue: sizes of the models; the package's table when left out.
+        cells: number of free places, half a metre apart; by default the kind's own. The plan has about so
+            many, mostly within two.
+        catalogue: sizes of the models; by default the package's table.
 
     Raises:
         SceneError: the kind is not known, or ``cells`` is too small.
@@ -202,7 +202,7 @@ def layout(kind: str, seed: int = 1, cells: int | None = None, catalogue: Catalo
     catalogue = Catalogue.bundled() if catalogue is None else catalogue
     kind_programme, share = scaled(kind, cells)
     if cells is not None and kind_programme is not programme(kind):
-        # The same furniture takes about the same floor in a larger room: a few drafts show how much.
+        # A few drafts measure how much floor the furniture takes, which hardly depends on the room's size.
         tried = [_attempt(kind_programme, share, kind, seed, -k, catalogue) for k in range(1, _TRIALS + 1)]
         free = sum(len(draft.cells) + draft.cut_off for draft in tried) / _TRIALS
         places = kind_programme.grid[0] * kind_programme.grid[1]
@@ -212,7 +212,7 @@ def layout(kind: str, seed: int = 1, cells: int | None = None, catalogue: Catalo
         found = _attempt(kind_programme, share, kind, seed, number, catalogue)
         if best is None or found.cost < best.cost:
             best = found
-        # A large room need not be met as exactly as a small one.
+        # Large rooms may miss the number of places by more.
         if best.cost <= max(_GOOD_ENOUGH, 0.02 * kind_programme.cells * (share != 1.0)):
             break
     assert best is not None

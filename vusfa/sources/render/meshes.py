@@ -148,7 +148,7 @@ def load_parts(catalogue: Catalogue, model: Model) -> list[Part]:
         )
     except SceneError:
         raise
-    except Exception as error:  # whatever a parser of files by strangers may raise
+    except Exception as error:  # a parser may raise anything for a damaged file
         raise SceneError(f"{model.name}: {model.file} is no sound OBJ file ({error})") from error
     geometry = scene.geometry.items() if hasattr(scene, "geometry") else [("", scene)]
     library = material_library(archive, model.file)
@@ -171,7 +171,7 @@ def _parts(geometry: Any, library: dict[str, Material], archive: Archive, model:
         diffuse = getattr(getattr(mesh.visual, "material", None), "diffuse", [180, 180, 180, 255])
         color = np.array(entry.color) if entry.color else np.array(diffuse, float)[:3] / 255
         texture, opacity = _texture(image) if image is not None else (None, None)
-        if entry.opacity < _GLASS:  # it still counts for the model's extent
+        if entry.opacity < _GLASS:  # invisible, but part of the model's extent
             yield Part(vertices, np.empty((0, 3), np.uint32), None, color)
             continue
         yield Part(
@@ -191,7 +191,7 @@ def place(
     elevation: float,
     facing: float,
 ) -> list[np.ndarray]:
-    """Vertices (n, 3) of each part in the renderer's frame: x to the left, y up, z forward.
+    """Place a model: vertices (n, 3) of each part in the renderer's frame, x to the left, y up, z forward.
 
     Args:
         parts: of one model.

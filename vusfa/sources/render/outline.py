@@ -1,4 +1,4 @@
-"""Rectangles on the floor, and the pieces of wall that a room's outline and its solid blocks show.
+"""Rectangles on the floor, and the visible pieces of wall of a room's outline and its solid blocks.
 
 A plan is seen from above: X to the right, Z forward, in metres; heading 0 looks along +Z, 90 along +X. A room
 is the rectangle (0, 0) to (width, depth) without its solid blocks (a cut-off corner, a partition, the wall
@@ -37,7 +37,7 @@ class Wall:
     length: float
 
     def point(self, t: float, out: float = 0.0) -> tuple[float, float]:
-        """The place ``t`` metres along the wall and ``out`` metres into the room.
+        """The point ``t`` metres along the wall and ``out`` metres into the room.
 
         >>> Wall((4.0, 3.0), (-1, 0), (0, -1), 4.0).point(1.0, 0.5)
         (3.0, 2.5)
@@ -71,13 +71,13 @@ def gap(rect: Rect, x: float, z: float) -> float:
 
 
 def footprint(x: float, z: float, width: float, depth: float, facing: float) -> Rect:
-    """The rectangle around something of ``width`` x ``depth`` that stands at (x, z) and looks to ``facing``.
+    """Bounding rectangle of a ``width`` x ``depth`` piece of furniture at (x, z) with heading ``facing``.
 
     >>> footprint(1.0, 1.0, 1.0, 0.5, 90.0)
     (0.75, 0.5, 1.25, 1.5)
     """
     angle = math.radians(facing)
-    # Right angles exactly: what stands flush against a wall must not reach into it by a rounding error.
+    # Exact at right angles: a rounding error would push furniture at a wall into it.
     cos, sin = (round(abs(f(angle)), 12) for f in (math.cos, math.sin))
     half_x = (width * cos + depth * sin) / 2
     half_z = (width * sin + depth * cos) / 2
@@ -114,7 +114,7 @@ def _spans(
 
 
 def wall_pieces(width: float, depth: float, solids: Sequence[Rect] = ()) -> list[Wall]:
-    """All visible pieces of wall: those of the outline, then the sides of the solid blocks.
+    """Find all visible pieces of wall: those of the outline, then the sides of the solid blocks.
 
     Args:
         width: of the room's rectangle, metres along X.

@@ -32,7 +32,7 @@ __all__ = [
 #: Roles of furniture: standing, lying on another piece, walked over, hanging from the ceiling, ...
 ROLES = ("floor", "top", "rug", "lamp", "hung", "door")
 
-# What hangs higher than this does not block the way.
+# Metres; higher obstacles do not block the way.
 _HEADROOM = 1.9
 
 

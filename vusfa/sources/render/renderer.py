@@ -1,4 +1,4 @@
-"""The camera: one denoised frame per pose, and its tone mapping to a picture."""
+"""The camera: a denoised frame per pose, and its tone mapping to a picture."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def look_at(x: float, z: float, heading: float, camera: Camera) -> tuple[list[fl
 
 
 def exposure_of(frames: np.ndarray) -> float:
-    """The factor that brings the median brightness of linear frames (n, H, W, 3) to 0.21.
+    """Factor that brings the median brightness of linear frames (n, H, W, 3) to 0.21.
 
     Raises:
         SceneError: the frames are black.
@@ -45,7 +45,7 @@ def exposure_of(frames: np.ndarray) -> float:
 
 
 def tone_map(frame: np.ndarray, exposure: float) -> np.ndarray:
-    """A linear frame (..., 3) as sRGB uint8; bright values are compressed by v / (1 + v / 5).
+    """Convert a linear frame (..., 3) to sRGB uint8; bright values are compressed by v / (1 + v / 5).
 
     >>> tone_map(np.array([0.0, 0.1, 1e9]), 1.0).tolist()
     [0, 88, 255]
@@ -74,7 +74,7 @@ class Renderer:
                 "fov_axis": "x",
                 "near_clip": 0.02,
                 "to_world": self._pose(0.0, 0.0, 0.0),
-                # A wider filter correlates the noise of pixels, which the denoiser keeps as detail.
+                # A wider filter would correlate the noise of pixels; the denoiser would keep it as detail.
                 "film": {
                     "type": "hdrfilm",
                     "width": camera.resolution[0],
@@ -106,7 +106,7 @@ class Renderer:
         return drjit.opaque(self._mi.UInt32, seed)
 
     def frame(self, x: float, z: float, heading: float, seed: int) -> np.ndarray:
-        """View from a pose, (H, W, 3) linear float32; the same seed gives the same noise."""
+        """Render the view from a pose, (H, W, 3) linear float32; the same seed gives the same noise."""
         import mitsuba_oidn
 
         self._values["to_world"] = self._pose(x, z, heading)

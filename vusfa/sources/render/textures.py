@@ -27,7 +27,7 @@ _PLANK = 0.14
 
 
 def random_stream(seed: int) -> np.random.RandomState:
-    """Random number generator whose numbers never change between versions of NumPy; seeds of any size.
+    """Random number generator with the same numbers in every version of NumPy; seeds of any size.
 
     >>> int(random_stream(1).randint(100))
     37
