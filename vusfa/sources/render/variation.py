@@ -158,7 +158,10 @@ def vary_plan(plan: Plan, variation: Variation, catalogue: Catalogue) -> Plan:
         )
     tint = np.array([1 + variation.warmth, 1.0, 1 - variation.warmth]) * variation.lamps
     if (tint != 1).any():
-        lights = [replace(light, radiance=tuple((light.radiance * tint).tolist())) for light in plan.lights]
+        lights = [
+            replace(light, radiance=tuple((np.array(light.radiance) * tint).tolist()))
+            for light in plan.lights
+        ]
         plan = replace(plan, lights=tuple(lights))
     if variation.fov != 1:
         plan = replace(plan, camera=replace(plan.camera, fov=plan.camera.fov * variation.fov))
