@@ -132,7 +132,7 @@ def test_a_replayed_frame_is_the_one_that_is_traced_anew() -> None:
     mi = load_mitsuba(choose_backend())
     scene = build_scene(mi, plan, catalogue)
     replaying = Renderer(mi, scene, plan.camera)
-    for state, heading in enumerate((0.0, 90.0, 180.0, 270.0)):
+    for state, heading in enumerate((0.0, 90.0, 180.0)):
         pose = (0.3 + 0.1 * state, 0.3, heading, state)
         np.testing.assert_array_equal(
             replaying.frame(*pose), Renderer(mi, scene, plan.camera).frame(*pose), err_msg=str(state)
