@@ -37,6 +37,7 @@ class Suite(StrEnum):
     eval = "eval"
     gpu = "gpu"
     scaling = "scaling"
+    ranks = "ranks"
     all = "all"
 
 
@@ -51,6 +52,7 @@ MODULES: dict[str, tuple[str, ...]] = {
     "eval": ("eval_suite",),
     "gpu": ("gpu_suite",),
     "scaling": ("scaling_suite",),
+    "ranks": ("ranks_suite",),
 }
 #: Several modules under one name.
 GROUPS = {"train": ("collect", "update", "solve", "memory"), "all": tuple(MODULES)}

@@ -17,6 +17,7 @@ __all__ = [
     "CheckpointError",
     "ConfigError",
     "GoalError",
+    "RankError",
     "ResultError",
     "SceneError",
     "VusfaError",
@@ -99,3 +100,16 @@ class ResultError(VusfaError):
 
 class WorkerError(VusfaError):
     """A process that collects data has died, does not answer, or cannot start."""
+
+
+class RankError(WorkerError):
+    """A rank of a data-parallel training is gone, or could not begin.
+
+    Args:
+        message: which one, and what has become of it.
+        is_quiet: another rank reports it.
+    """
+
+    def __init__(self, message: str, is_quiet: bool = False) -> None:
+        super().__init__(message)
+        self.is_quiet = is_quiet

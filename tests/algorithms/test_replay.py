@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from tensordict import TensorDict
 
 from vusfa.algorithms import HindsightReplay, HindsightSampler
-from vusfa.algorithms.replay import steps_ahead
+from vusfa.algorithms.replay import merge_replays, share_of_replay, steps_ahead
 from vusfa.errors import ConfigError
 
 ENVS, LONG = 3, 40
@@ -123,3 +123,25 @@ def test_what_does_not_fit_is_refused():
         HindsightReplay(400, ENVS, capacity=2)
     with pytest.raises(ConfigError, match="own_future 2"):
         HindsightSampler(ENVS, 400, own_future=2)
+
+
+@pytest.mark.parametrize("capacity", [60, 500])
+def test_merged_buffers_are_that_of_all_environments_and_its_shares_are_they(capacity: int):
+    """Three buffers of one environment each, and one of three; filled once over, and half."""
+    whole = HindsightReplay(400, ENVS, capacity=capacity // ENVS * ENVS)
+    parts = [HindsightReplay(400, 1, capacity=capacity // ENVS) for _ in range(ENVS)]
+    for first in range(0, LONG, 5):
+        batch = walked(first, 5, {1: {7, 20}})
+        whole.extend(batch)
+        for row, part in enumerate(parts):
+            part.extend(batch[row : row + 1])
+    states = [part.state_dict() for part in parts]
+    merged = merge_replays(states)
+    torch.testing.assert_close(merged, whole.state_dict(), rtol=0, atol=0)
+    for rank, state in enumerate(states):
+        share = share_of_replay(merged, rank, ENVS)
+        share["sampler"] = state["sampler"]  # seen states are those of all
+        torch.testing.assert_close(share, state, rtol=0, atol=0)
+        again = HindsightReplay(400, 1, capacity=capacity // ENVS)
+        again.load_state_dict(share)
+    assert merge_replays([HindsightReplay(9, 2).state_dict()] * 2)["rows"] == {}

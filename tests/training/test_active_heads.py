@@ -140,5 +140,5 @@ def test_a_worker_rotates_too(made: Callable[..., Trainer], fast_workers: None) 
 def test_goals_that_no_environment_could_have(made: Callable[..., Trainer]) -> None:
     with pytest.raises(ConfigError, match=r"collector.num_envs=6 leaves some of the 8 goals"):
         made("env.goals=random:4", "env.goal_sampling=fixed")
-    with pytest.raises(ConfigError, match=r"lend; give agent.shared_heads=true, or another collector"):
+    with pytest.raises(ConfigError, match=r"lend each process some; give agent.shared_heads=true"):
         made("collector=hogwild", "collector.num_envs=6", "optim=tf_rmsprop")

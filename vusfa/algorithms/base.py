@@ -7,7 +7,7 @@ algorithm names no collector, file or logger. A new one is a subclass and one li
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -87,6 +87,22 @@ class Algorithm:
 
     def after_step(self) -> None:
         """What follows the last optimizer step of an update, such as a multiplier's step."""
+
+    def share_statistics(self, mean: Callable[[Tensor], Tensor]) -> None:
+        """Compute a batch's statistics, such as its advantages' mean, over all ranks of a data-parallel
+        training; ``mean`` gives the mean of a tensor over them. Called once, before the first batch."""
+
+    def take_means(self, terms: Mapping[str, Tensor]) -> None:
+        """Keep of an update's terms, which are now means over all ranks, what :meth:`after_step` reads."""
+
+    def merge_states(self, states: Sequence[dict[str, Any]]) -> dict[str, Any]:
+        """The ``state_dict`` of one process in place of all ranks, from theirs, None of those that are gone;
+        by default the first. A ``CheckpointError`` where none can be left out."""
+        return states[0]
+
+    def share_of_state(self, state: dict[str, Any], rank: int, size: int) -> dict[str, Any]:
+        """What a rank loads of a ``state_dict`` of one process; by default all of it."""
+        return state
 
     def state_dict(self) -> dict[str, Any]:
         """What it has learned besides the agent, as tensors and plain data."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -11,7 +12,7 @@ from torch import Tensor
 from vusfa.errors import ConfigError
 from vusfa.scenes.paths import ShortestPaths
 
-__all__ = ["ExperienceGraph", "passing_weights"]
+__all__ = ["ExperienceGraph", "merge_graphs", "passing_weights"]
 
 
 def passing_weights(distance: Tensor) -> Tensor:
@@ -185,6 +186,11 @@ class ExperienceGraph:
         self.successor, self.scene_of = successor.clone(), scene_of.clone()
         self._scenes.clear()
         self._find_goals()
+
+
+def merge_graphs(states: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """The ``state_dict`` of a graph with the transitions of all of them."""
+    return {name: torch.stack([state[name] for state in states]).amax(0) for name in states[0]}
 
 
 def _draw(distance: Tensor, number: int, path_share: float) -> Tensor:

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from tensordict import TensorDictBase
 from torch import Tensor
 
 from vusfa.algorithms.registry import register_algorithm
-from vusfa.algorithms.replay import HindsightReplay
+from vusfa.algorithms.replay import HindsightReplay, merge_replays, share_of_replay
 from vusfa.algorithms.usf import USF
 from vusfa.errors import CheckpointError, ConfigError
 from vusfa.modules import Agent
@@ -86,6 +86,17 @@ class Hindsight(USF):
     def state_dict(self) -> dict[str, Any]:
         """The loss's buffers, and the replay buffer."""
         return {**super().state_dict(), "replay": self.replay.state_dict()}
+
+    def merge_states(self, states: Sequence[dict[str, Any]]) -> dict[str, Any]:
+        """With the replay buffer that one process would have."""
+        if None in states:
+            raise CheckpointError("the replay buffers of other ranks are gone")
+        return {**states[0], "replay": merge_replays([state["replay"] for state in states])}
+
+    def share_of_state(self, state: dict[str, Any], rank: int, size: int) -> dict[str, Any]:
+        """With the transitions of the rank's environments."""
+        replay = state.get("replay")
+        return {**state, "replay": share_of_replay(replay, rank, size)} if replay else state
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Continue with the replay buffer; a ``CheckpointError`` where the state has none."""

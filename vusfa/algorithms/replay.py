@@ -7,6 +7,7 @@ in the scene, and the steps to a goal are recorded, too: the sampler is ours, st
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -17,7 +18,7 @@ from torchrl.data.replay_buffers import RandomSampler, Storage
 
 from vusfa.errors import ConfigError
 
-__all__ = ["HindsightReplay", "HindsightSampler", "steps_ahead"]
+__all__ = ["HindsightReplay", "HindsightSampler", "merge_replays", "share_of_replay", "steps_ahead"]
 
 
 def steps_ahead(clock: Tensor, row: Tensor, num_envs: int, horizon: int) -> Tensor:
@@ -247,6 +248,41 @@ class HindsightReplay:
             self.buffer.writer.load_state_dict(writer)
         self._clock = state["clock"]
         self.sampler.load_state_dict(state["sampler"])
+
+
+def merge_replays(states: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """The ``state_dict`` of one buffer for all environments, from those of equal parts of them, in order."""
+    first, num_envs, rows = states[0], len(states[0]["clock"]), {}
+    if first["rows"]:
+        parts = [TensorDict(state["rows"], [len(state["rows"]["clock"])]) for state in states]
+        rows = _numbered(torch.cat([part.view(-1, num_envs) for part in parts], 1))
+    seen = torch.stack([state["sampler"]["scene_of"] for state in states]).amax(0)
+    return {
+        "rows": rows,
+        "writer": {name: number * len(states) for name, number in first["writer"].items()},
+        "clock": torch.cat([state["clock"] for state in states]),
+        "sampler": {"scene_of": seen},
+    }
+
+
+def share_of_replay(state: dict[str, Any], rank: int, size: int) -> dict[str, Any]:
+    """The share of a ``state_dict`` that :func:`merge_replays` would have had in that place."""
+    num_envs, rows = len(state["clock"]), state["rows"]
+    if rows:
+        rows = _numbered(TensorDict(rows, [len(rows["clock"])]).view(-1, num_envs).chunk(size, 1)[rank])
+    return {
+        **state,
+        "rows": rows,
+        "writer": {name: number // size for name, number in state["writer"].items()},
+        "clock": state["clock"].chunk(size)[rank].clone(),
+    }
+
+
+def _numbered(steps: Any) -> dict[str, Any]:
+    """Rows of a buffer, from steps (T, B) of environments."""
+    rows = steps.reshape(-1).to_dict()
+    rows["index"] = torch.arange(len(rows["clock"])).view_as(rows["index"])
+    return rows
 
 
 def _check_rows(rows: dict[str, Any], length: int, scene_of: Tensor) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,7 +10,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from vusfa.algorithms.base import AlgorithmSettings
-from vusfa.algorithms.experience import ExperienceGraph
+from vusfa.algorithms.experience import ExperienceGraph, merge_graphs
 from vusfa.algorithms.registry import register_algorithm
 from vusfa.algorithms.usf import USF
 from vusfa.errors import CheckpointError, ConfigError
@@ -128,6 +128,11 @@ class ReplaySearch(USF):
     def state_dict(self) -> dict[str, Any]:
         """The loss's buffers, and the graph."""
         return {**super().state_dict(), "experience": self.graph.state_dict(), "searches": self._searches}
+
+    def merge_states(self, states: Sequence[dict[str, Any]]) -> dict[str, Any]:
+        """With the transitions of all ranks, which each gets when it resumes."""
+        graphs = [state["experience"] for state in states if state is not None]
+        return {**states[0], "experience": merge_graphs(graphs)}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Continue with the graph; a ``CheckpointError`` where the state has none."""

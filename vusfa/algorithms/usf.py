@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import torch
@@ -113,6 +113,15 @@ class USF(Algorithm):
         """A step of the multiplier."""
         if self.multiplier is not None:
             self.multiplier.step()
+
+    def share_statistics(self, mean: Callable[[Tensor], Tensor]) -> None:
+        """Normalize advantages over all ranks."""
+        self.loss.value_estimator.mean = mean
+
+    def take_means(self, terms: Mapping[str, Tensor]) -> None:
+        """Take the KL of all ranks, which moves the multiplier."""
+        if "kl" in terms:
+            self.loss.last_kl.copy_(terms["kl"])
 
     def state_dict(self) -> dict[str, Any]:
         """The loss's buffers (coefficients, multiplier, last KL), without the networks."""

@@ -34,7 +34,7 @@ from vusfa.cli.resume import resumed_settings
 from vusfa.conf import FOLDER
 from vusfa.conf import compose as conf_compose
 from vusfa.conf.schema import check_overrides, mistake, register_schema, unknown_setting, validated
-from vusfa.errors import ResultError, VusfaError, WorkerError, near
+from vusfa.errors import RankError, ResultError, VusfaError, WorkerError, near
 from vusfa.files import say, use_own_temporary_folder
 from vusfa.modules.config import resolve_config
 from vusfa.training.folder import AUTO, found_checkpoint
@@ -163,6 +163,8 @@ def _quoted(argument: str) -> str:
 def _report(job: Callable[[], int], folder: Path) -> int:
     try:
         return job()
+    except RankError as error:
+        return FAILED if error.is_quiet else _complain(str(error), FAILED)
     except (WorkerError, ResultError) as error:
         return _complain(str(error), FAILED)
     except VusfaError as error:

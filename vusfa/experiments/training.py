@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping, Sequence
-from contextlib import ExitStack, suppress
+from contextlib import ExitStack, redirect_stderr, suppress
 from functools import partial
+from pathlib import Path
 from typing import Any, NamedTuple
 
 from omegaconf import DictConfig, OmegaConf
@@ -27,13 +29,21 @@ from vusfa.training import (
     run_training,
     set_threads,
 )
+from vusfa.training.distributed import joined
 from vusfa.training.folder import AUTO, CHECKPOINT, found_checkpoint
 from vusfa.training.precision import describe_autocast
+from vusfa.training.ranks import Ranks
 from vusfa.training.scene_files import settings_seen_from
 from vusfa.training.setup import decide_autocast
 from vusfa.training.trackers import sweep_run_id
 
 __all__ = ["Trained", "compose_settings", "train"]
+
+
+_WORKERS = (
+    "collector={kind}: one learner and {num_workers} workers; on as many cores"
+    " torchrun --nproc-per-node={num_workers} -m vusfa.cli train collector=single is faster (docs/scaling.md)"
+)
 
 
 class Trained(NamedTuple):
@@ -61,7 +71,8 @@ def compose_settings(overrides: Sequence[str]) -> DictConfig:
 def train(settings: Mapping[str, Any], overrides: Sequence[str] = (), draw: Draw | None = None) -> Trained:
     """Train, and leave metrics, checkpoints and an evaluation in ``settings["folder"]`` (that of the
     trainer's settings where the caller's are null). The last lines say where, and whether a random walk does
-    better.
+    better. Where the environment names several ranks (torchrun), this process is one of them, see
+    :mod:`vusfa.training.distributed`; the first leaves the files.
 
     Args:
         settings: as in vusfa/conf/train.yaml, resolved.
@@ -78,29 +89,47 @@ def train(settings: Mapping[str, Any], overrides: Sequence[str] = (), draw: Draw
     if plain["resume"] == AUTO:
         plain["resume"] = found_checkpoint(plain["folder"])
     set_threads(plain["threads"])
-    folder = RunFolder(plain["folder"], plain)
-    decided, plain["autocast"] = plain["autocast"] == "auto", decide_autocast(plain)
-    trainer = make_trainer(plain, overrides)
+    with joined(plain) as ranks, ExitStack() as stack:
+        if not ranks.is_first:  # what all find, the first says
+            stack.enter_context(redirect_stderr(stack.enter_context(open(os.devnull, "w"))))
+        return _train(plain, overrides, draw, ranks)
+
+
+def _train(plain: dict[str, Any], overrides: Sequence[str], draw: Draw | None, ranks: Ranks) -> Trained:
+    with ranks.preparing():
+        folder = RunFolder(plain["folder"], plain) if ranks.is_first else None
+        decided, plain["autocast"] = plain["autocast"] == "auto", decide_autocast(plain)
+    plain["autocast"] = ranks.first(lambda: plain["autocast"])  # machines may differ
     evaluated = plain["evaluation"]["goals"]
-    if evaluated:
-        check_comparison(trainer.scenes, **_evaluation(trainer))
-    changes = trainer.resume(plain["resume"]) if plain["resume"] else []
+    with ranks.preparing():
+        trainer = make_trainer(plain, overrides, ranks=ranks)
+        if evaluated:
+            check_comparison(trainer.scenes, **_evaluation(trainer))
+        changes = trainer.resume(plain["resume"]) if plain["resume"] else []
+    ranks.equalize(list(trainer.algorithm.parameters()))
     if not plain["resume"] and "wandb" in plain["logger"]["kinds"]:
         trainer.run_id = sweep_run_id() or trainer.run_id
     with ExitStack() as stack:
-        stack.enter_context(folder)
-        plain["folder"] = str(folder.path)
+        if folder is not None:
+            plain["folder"] = str(stack.enter_context(folder).path)
+        plain["folder"] = ranks.first(lambda: plain["folder"])
+        place, log = Path(plain["folder"]), plain["logger"]
         loggers = stack.enter_context(
             make_loggers(
-                folder=folder.path,
-                config=settings_seen_from(folder.path, plain),
+                folder=place,
+                config=settings_seen_from(place, plain),
                 run_id=trainer.run_id,
                 resume_frames=trainer.frames if plain["resume"] else None,
-                **plain["logger"],
+                **(log if ranks.is_first else {**log, "kinds": []}),
             )
         )
-        path, validation = folder.path / CHECKPOINT, None
+        path, validation = place / CHECKPOINT, None
         notes = [] if trainer.note is None else [trainer.note]
+        if ranks.size > 1:
+            rows = plain["collector"]["num_envs"] // ranks.size
+            notes.append(f"{ranks.size} ranks with {rows} environments each")
+        if plain["collector"]["kind"] in ("multi_sync", "multi_async"):
+            notes.append(_WORKERS.format(**plain["collector"]))
         precision = describe_autocast(plain["autocast"], decided=decided)
         for line in (precision, *notes, *(f"resumed with {change}" for change in changes)):
             say(line)
@@ -112,13 +141,15 @@ def train(settings: Mapping[str, Any], overrides: Sequence[str] = (), draw: Draw
             run_training(trainer, path, loggers, stop, progress, converged, validation)
         loggers.exit_code = stop.exit_code
         comparison = None
+        if not ranks.is_first:
+            return Trained(trainer, None, stop.exit_code)
         if evaluated and not stop.received:
             comparison = _evaluate(trainer)
-            comparison.save(folder.path / "evaluation")
+            comparison.save(place / "evaluation")
             loggers.log_table("evaluation", comparison.rows, trainer.frames)
             with suppress(BrokenPipeError):
                 print_summary(comparison.rows, note=comparison.note)
-    say(f"next: vusfa report {folder.path}, vusfa film {folder.path}, vusfa evaluate {folder.path}")
+    say(f"next: vusfa report {place}, vusfa film {place}, vusfa evaluate {place}")
     say(str(path))
     if validation is not None and not stop.received and (advice := validation.advice()):
         say(advice)

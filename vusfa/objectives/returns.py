@@ -101,6 +101,8 @@ class USFEstimator(ValueEstimatorBase):
         self.average_gae = average_gae
         self.min_advantage_std = min_advantage_std
         self.bootstrap_at_timeout = bootstrap_at_timeout
+        #: mean of a tensor over the ranks of a data-parallel training; None for one process
+        self.mean: Callable[[Tensor], Tensor] | None = None
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
         """Both buffers are read as Python numbers: they stay in double precision, on the CPU."""
@@ -208,7 +210,9 @@ class USFEstimator(ValueEstimatorBase):
         if self.has_successor:  # phi from s_{t+1} on: the paper's Eqs. 4 and 13 and its code, not its Eq. 6
             returns.append(successor_return(at_next[2], at_next[1], gamma, ended, terminated, lmbda))
         advantage = returns[0] - value.to(reward.dtype)
-        if self.normalize_advantage or self.average_gae:
+        if self.normalize_advantage and self.mean is not None:
+            advantage = _normalize_together(advantage, self.min_advantage_std, self.mean)
+        elif self.normalize_advantage or self.average_gae:
             advantage = _normalize(advantage, mask, self.min_advantage_std, int(self.average_gae))
         return TensorDict(dict(zip(self.out_keys, [advantage, *returns], strict=True)), data.batch_size)
 
@@ -229,3 +233,12 @@ def _normalize(advantage: Tensor, mask: Tensor | None, min_std: float, correctio
     else:
         valid = advantage[mask.reshape(*mask.shape[: advantage.ndim - 1], -1).any(-1)]
     return (advantage - valid.mean()) / valid.std(correction=correction).clamp_min(min_std)
+
+
+def _normalize_together(
+    advantage: Tensor, min_std: float, mean_of_ranks: Callable[[Tensor], Tensor]
+) -> Tensor:
+    """As :func:`_normalize`, over batches of one size on all ranks."""
+    mean = mean_of_ranks(advantage.mean())
+    variance = mean_of_ranks((advantage - mean).square().mean())
+    return (advantage - mean) / variance.sqrt().clamp_min(min_std)

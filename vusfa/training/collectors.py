@@ -124,6 +124,7 @@ def make_collector(
     seed: int = 0,
     autocast: bool = False,
     timeout: float | None = None,
+    first_goal: int = 0,
 ) -> BaseCollector:
     """Make a collector that never ends; the caller counts the frames.
 
@@ -139,6 +140,7 @@ def make_collector(
         autocast: workers compute in bfloat16 where that is safe; in this process the caller decides, by
             collecting within :class:`torch.autocast`.
         timeout: seconds after which a worker that sends nothing counts as dead; None: never.
+        first_goal: of the first environment, where each keeps its goal (``single``).
 
     Raises:
         ConfigError: see :func:`rows_per_worker`.
@@ -152,7 +154,7 @@ def make_collector(
     }
     # Made here in any case: what is wrong with the settings then shows as an error of ours, not as a
     # worker's.
-    env = make_env(batch_size=[rows], first_goal=0, seed=seed)
+    env = make_env(batch_size=[rows], first_goal=first_goal, seed=seed)
     if kind == "single":
         # Told where everything is, the collector does not copy each step to see that it is there.
         shared |= {"device": env.device, "track_traj_ids": False}
@@ -239,7 +241,8 @@ def load_collector_state(
 
     Args:
         collector: new, or one that has collected.
-        state: of a collector of the same kind and settings.
+        state: of a collector of the same kind and settings; where ``env`` and ``generator`` are None, its
+            own draws go on.
         path: of the checkpoint, for messages.
 
     Raises:
@@ -248,6 +251,8 @@ def load_collector_state(
     if not isinstance(collector, Collector) or not state:
         return
     own = collector_state(collector)
+    anew = [name for name in ("env", "generator") if state.get(name, own) is None]
+    state = {**state, **{name: own[name] for name in anew}}
     if not isinstance(state.get("carrier"), dict):
         raise mended(path, "its entry 'collector.carrier' is missing")
     if state.get("batch_size") != own["batch_size"]:

@@ -24,7 +24,6 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, multiprocessing
 from torchrl.collectors import BaseCollector
-from torchrl.envs import EnvBase
 
 from vusfa.algorithms import annealed
 from vusfa.errors import ConfigError, WorkerError
@@ -229,14 +228,10 @@ def _make_single(
     rows = chosen["num_envs"] // chosen["num_workers"]
     return make_collector(
         "single",
-        partial(_with_goals, make_env, rank * rows),
+        make_env,
         policy,
         num_envs=rows,
         rollout=chosen["rollout"],
         seed=settings["seed"] + rank,
+        first_goal=rank * rows,
     )
-
-
-def _with_goals(make_env: MakeEnv, first: int, *, first_goal: int, **given: Any) -> EnvBase:
-    """The environments of a worker get the goals that come after those of the workers before it."""
-    return make_env(first_goal=first + first_goal, **given)

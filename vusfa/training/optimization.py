@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 
-from vusfa.errors import ConfigError
+from vusfa.errors import ConfigError, VusfaError
 from vusfa.objectives import A3CRMSprop, TFRMSprop
 
-__all__ = ["OPTIMIZERS", "descend", "make_optimizer", "total_loss"]
+__all__ = ["OPTIMIZERS", "check_finite", "descend", "make_optimizer", "total_loss"]
 
 OPTIMIZERS = ("adam", "rmsprop", "tf_rmsprop", "a3c_rmsprop")
 
@@ -27,7 +27,11 @@ def total_loss(terms: Mapping[str, Tensor]) -> Tensor:
 
 
 def descend(
-    optimizer: torch.optim.Optimizer, total: Tensor, lr: float, max_grad_norm: float | None
+    optimizer: torch.optim.Optimizer,
+    total: Tensor,
+    lr: float,
+    max_grad_norm: float | None,
+    average: Callable[[list[nn.Parameter]], None] | None = None,
 ) -> Tensor:
     """Make one optimization step against the gradient of ``total``.
 
@@ -37,6 +41,7 @@ def descend(
         lr: learning rate of this step.
         max_grad_norm: all gradients as one vector are clipped to this norm; None leaves them, as does
             :class:`~vusfa.objectives.TFRMSprop`, which clips every tensor on its own.
+        average: replaces the gradients of these parameters by their means over all ranks, before clipping.
 
     Returns:
         the gradient's norm before clipping, a scalar.
@@ -46,12 +51,37 @@ def descend(
         group["lr"] = lr
     optimizer.zero_grad()
     total.backward()
+    if average is not None:
+        average(params)
     if isinstance(optimizer, TFRMSprop) or max_grad_norm is None:
         norm = nn.utils.get_total_norm([param.grad for param in params if param.grad is not None])
     else:
         norm = nn.utils.clip_grad_norm_(params, max_grad_norm)
     optimizer.step()
     return norm
+
+
+@torch.no_grad()
+def check_finite(params: Iterable[Tensor], module: nn.Module, frames: int) -> None:
+    """Refuse parameters that are not finite.
+
+    Args:
+        params: all that are trained.
+        module: has those that the message names.
+        frames: trained on.
+
+    Raises:
+        VusfaError: naming them.
+    """
+    # one number for all weights: a short batch is logged at every update
+    if nn.utils.get_total_norm(params).isfinite():
+        return
+    wrong = [name for name, param in module.named_parameters() if not param.isfinite().all()]
+    if wrong:
+        raise VusfaError(
+            f"after {frames:,} frames the weights {', '.join(wrong)} are not finite any more; choose"
+            " a smaller optim.lr or optim.max_grad_norm, and resume an earlier checkpoint or begin anew"
+        )
 
 
 def make_optimizer(

@@ -30,8 +30,8 @@ def random_state() -> dict[str, Any]:
     }
 
 
-def restore_random_state(state: Mapping[str, Any]) -> None:
-    """Put the global random generators back to where :func:`random_state` found them.
+def restore_random_state(state: Mapping[str, Any] | None) -> None:
+    """Put the global random generators back to where :func:`random_state` found them; None leaves them.
 
     >>> before = random_state()
     >>> first = torch.rand(1), random.random(), np.random.rand()
@@ -39,6 +39,8 @@ def restore_random_state(state: Mapping[str, Any]) -> None:
     >>> first == (torch.rand(1), random.random(), np.random.rand())
     True
     """
+    if state is None:
+        return
     torch.set_rng_state(state["torch"].cpu())
     if state["cuda"] and torch.cuda.is_available():
         torch.cuda.set_rng_state_all([generator.cpu() for generator in state["cuda"]])

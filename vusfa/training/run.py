@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import copy
 import math
 import shutil
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import suppress
+from functools import partial
 from pathlib import Path
 
 from tensordict import TensorDictBase
 
-from vusfa.errors import ResultError, VusfaError, WorkerError
+from vusfa.errors import RankError, ResultError, VusfaError, WorkerError
 from vusfa.files import replacing, write_npz
 from vusfa.training.folder import BEST, EPISODES
 from vusfa.training.loggers import Logger
@@ -38,6 +41,8 @@ def run_training(
 ) -> None:
     """Update until ``total_frames``, convergence or a signal, with lines of the log and checkpoints.
 
+    The ranks of a data-parallel training all call this, and end after the same update.
+
     Args:
         trainer: new, or resumed.
         checkpoint: file, written at intervals, where :data:`SCORE` is the best so far, and at the end;
@@ -57,7 +62,7 @@ def run_training(
         try:
             _run(trainer, batches, checkpoint, loggers, stop, progress, converged, validate)
         except (WorkerError, ResultError) as error:
-            if not (stop.received and isinstance(error, WorkerError)):
+            if not (stop.received and isinstance(error, WorkerError)) or isinstance(error, RankError):
                 raise _with_whereabouts(error, trainer, checkpoint, loggers) from error
             loggers.log_checkpoint(trainer.save(checkpoint), trainer.frames)  # the signal was theirs, too
 
@@ -74,22 +79,24 @@ def _run(
 ) -> None:
     total, log_every = trainer.settings["total_frames"], trainer.settings["log_every"]
     checkpoint_every = trainer.settings["checkpoint_every"]
-    saved = -1
+    saved, ranks = -1, trainer.ranks
+    ranks.signal = lambda: stop.received
     every, ended = trainer.settings["early_stopping"]["every"] if converged else total, False
-    while trainer.frames < total and not stop.received and not ended:
+    while trainer.frames < total and not ranks.stopped and not ended:
         before = trainer.frames
         trainer.update(batches)
+        stop.received = ranks.stopped or stop.received
         progress.update(trainer.frames)
         ended = trainer.frames >= total  # a short training is logged, too
         if converged is not None and not ended and before // every < trainer.frames // every:
             with trainer.whole():
-                ended = converged()
+                ended = ranks.first(converged)
         is_best = False
         if ended or before // log_every < trainer.frames // log_every:
             validated: Mapping[str, float] = {}
             if validate is not None:
                 with trainer.whole():
-                    validated = validate(ended)
+                    validated = ranks.first(partial(validate, ended))
             metrics = trainer.metrics() | dict(validated)
             loggers.log_metrics(metrics, trainer.frames)
             progress.rates(metrics, validated=validate is not None)
@@ -105,6 +112,8 @@ def _run(
 
 def _save(trainer: Trainer, checkpoint: Path, loggers: Logger, is_best: bool = False) -> None:
     trainer.save(checkpoint)
+    if not trainer.ranks.is_first:
+        return
     if trainer.episodes.is_aggregated:
         write_npz(checkpoint.with_name(EPISODES), trainer.episodes.table())
     if is_best:
@@ -114,9 +123,11 @@ def _save(trainer: Trainer, checkpoint: Path, loggers: Logger, is_best: bool = F
 
 
 def _with_whereabouts(error: VusfaError, trainer: Trainer, checkpoint: Path, loggers: Logger) -> VusfaError:
-    try:
-        loggers.log_checkpoint(trainer.save(checkpoint), trainer.frames)
-        return type(error)(f"{error}; all {trainer.frames:,} frames are in {checkpoint}: resume it")
-    except VusfaError:
-        kept = f"resume from {checkpoint}" if checkpoint.is_file() else "there is no checkpoint yet"
-        return type(error)(f"{error}; {kept}")
+    kept = f"resume from {checkpoint}" if checkpoint.is_file() else "there is no checkpoint yet"
+    if trainer.ranks.is_first:
+        with suppress(VusfaError):
+            loggers.log_checkpoint(trainer.save(checkpoint), trainer.frames)
+            kept = f"all {trainer.frames:,} frames are in {checkpoint}: resume it"
+    whole = copy.copy(error)
+    whole.args = (f"{error}; {kept}",)
+    return whole

@@ -24,6 +24,7 @@ from vusfa.training.hogwild import HogwildTrainer
 from vusfa.training.memory import keep_memory
 from vusfa.training.optimization import make_optimizer
 from vusfa.training.precision import resolve_autocast
+from vusfa.training.ranks import Ranks, settings_of_rank
 from vusfa.training.trainer import Trainer
 from vusfa.training.upgrade import upgrade_config
 
@@ -31,7 +32,10 @@ __all__ = ["decide_autocast", "make_observation", "make_trainer", "row_name", "s
 
 
 def make_trainer(
-    settings: Mapping[str, Any], overrides: Sequence[str] = (), scenes: SceneSet | None = None
+    settings: Mapping[str, Any],
+    overrides: Sequence[str] = (),
+    scenes: SceneSet | None = None,
+    ranks: Ranks | None = None,
 ) -> Trainer:
     """Make a trainer from the settings of ``vusfa train``.
 
@@ -39,10 +43,12 @@ def make_trainer(
         settings: as in vusfa/conf/train.yaml, plain and resolved.
         overrides: the command line that made them, kept in checkpoints.
         scenes: the world; opened as the settings say when not given.
+        ranks: of a data-parallel training (:mod:`vusfa.training.distributed`), which the trainer belongs to.
 
     Raises:
         VusfaError: settings that are out of range or do not fit each other.
     """
+    ranks = ranks or Ranks()
     torch.manual_seed(settings["seed"])
     device, optim = usable_device(settings["device"]), settings["optim"]
     if not isinstance(settings["autocast"], bool):
@@ -60,7 +66,8 @@ def make_trainer(
     rows_per_worker(**{name: settings["collector"][name] for name in counts})  # refused before any work
     chosen = {key: value for key, value in settings["agent"].items() if value is not None}
     agent = make_agent(scenes=scenes, **chosen).to(device)
-    algorithm = make_algorithm(settings["algorithm"]["name"], agent, scenes, settings)
+    own = settings if ranks.size == 1 else settings_of_rank(settings, ranks.size)
+    algorithm = make_algorithm(settings["algorithm"]["name"], agent, scenes, own)
     optimizer = make_optimizer(
         algorithm.parameters(),
         optim["kind"],
@@ -70,6 +77,8 @@ def make_trainer(
         **optim["options"],
     )
     note = None if settings["resume"] else algorithm.prepare()
+    if ranks.size > 1:
+        algorithm.share_statistics(ranks.mean)
     observation = make_observation(agent, scenes, task.pop("crop"))
     transforms = [*([observation] if observation is not None else []), *agent.make_env_transforms()]
     env = partial(make_env, scenes, transforms, history=agent.config["history"], device=device, **task)
@@ -79,13 +88,16 @@ def make_trainer(
     def collector(policy: TensorDictModuleBase) -> BaseCollector:
         # of a resumed training the frames are known by now
         turned = {} if rotation is None else {"first_frame": trainer.frames}
-        return make_collector(
+        made = make_collector(
             make_env=partial(env, **turned),
             policy=policy,
             seed=settings["seed"],
             autocast=settings["autocast"],
-            **settings["collector"],
+            first_goal=ranks.rank * own["collector"]["num_envs"],
+            **own["collector"],
         )
+        ranks.seed(made, settings["seed"] + trainer.frames)
+        return made
 
     parts: dict[str, Any] = {
         "scenes": scenes,
@@ -97,12 +109,14 @@ def make_trainer(
         "overrides": overrides,
         "observation": observation,
         "note": note,
+        "ranks": ranks,
     }
     if turns is not None and turns.rotates and agent.num_scenes > 1:
-        if settings["collector"]["kind"] == "hogwild":
+        if settings["collector"]["kind"] == "hogwild" or ranks.size > 1:
+            what = "collector=hogwild" if ranks.size == 1 else "a training of several ranks"
             raise ConfigError(
-                "collector=hogwild shares the heads of all scenes among its workers, which env.active_scenes"
-                " would lend; give agent.shared_heads=true, or another collector"
+                f"{what} shares the heads of all scenes, of which env.active_scenes would lend each process"
+                " some; give agent.shared_heads=true"
             )
         if settings["collector"]["kind"] == "single":
             parts["heads"] = ActiveHeads(agent, optimizer)

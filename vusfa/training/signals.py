@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import signal
+import threading
 from types import FrameType, TracebackType
 from typing import Any
 
@@ -14,7 +15,7 @@ _STOPPING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 class StopOnSignal:
     """Context manager: the first SIGINT, SIGTERM or SIGHUP is recorded; a second one acts at once.
 
-    A hang-up that is ignored (``nohup``) stays ignored.
+    A hang-up that is ignored (``nohup``) stays ignored. Outside the main thread nothing is recorded.
 
     Attributes:
         received: number of the signal, or None.
@@ -36,6 +37,8 @@ class StopOnSignal:
         return 128 + self.received if self.received is not None else 0
 
     def __enter__(self) -> StopOnSignal:
+        if threading.current_thread() is not threading.main_thread():  # only that one may set handlers
+            return self
         for number in _STOPPING:
             if number != signal.SIGHUP or signal.getsignal(number) != signal.SIG_IGN:
                 self._before[number] = signal.signal(number, self._note)

@@ -22,7 +22,6 @@ from torchrl.collectors import BaseCollector, Collector
 
 from vusfa.algorithms import Algorithm, annealed
 from vusfa.envs import SceneObservation
-from vusfa.errors import VusfaError
 from vusfa.modules import Agent, InferencePolicy
 from vusfa.scenes import SceneSet
 from vusfa.training.active_heads import ActiveHeads
@@ -37,9 +36,10 @@ from vusfa.training.checkpoint import (
 from vusfa.training.collectors import collector_state, coming_goals, load_collector_state, opened
 from vusfa.training.content import NO_VALIDATION, check_like, restore
 from vusfa.training.metrics import EpisodeMeter, MeanMeter
-from vusfa.training.optimization import descend, total_loss
+from vusfa.training.optimization import check_finite, descend, total_loss
 from vusfa.training.precision import resolve_autocast
 from vusfa.training.random_state import check_random_state, random_state, restore_random_state
+from vusfa.training.ranks import Ranks
 from vusfa.training.scene_files import scene_sources, settings_seen_from, without_places
 from vusfa.training.workers import supervised
 
@@ -63,6 +63,7 @@ class Trainer:
         observation: transform between world and agent, or None.
         note: message of the algorithm's preparation, or None.
         heads: of active scenes, where only these are computed; for a single collector.
+        ranks: of a data-parallel training, each with a trainer; by default this process alone.
 
     Attributes:
         actor: the policy; writes ``action``.
@@ -89,11 +90,12 @@ class Trainer:
         observation: SceneObservation | None = None,
         note: str | None = None,
         heads: ActiveHeads | None = None,
+        ranks: Ranks | None = None,
     ) -> None:
         self.scenes, self.goals, self.agent = scenes, goals, agent
         self.algorithm, self.optimizer = algorithm, optimizer
         self.settings, self.overrides = settings, overrides
-        self.observation, self.note, self.heads = observation, note, heads
+        self.observation, self.note, self.heads, self.ranks = observation, note, heads, ranks or Ranks()
         self.actor = agent.get_policy_operator(out_keys=["action"])
         self.acting = InferencePolicy(agent)
         self._make_collector = partial(make_collector, self.acting)
@@ -153,13 +155,7 @@ class Trainer:
         Returns:
             the batch, and the numbers to log: the losses' terms and the gradient's norm.
         """
-        began, optim = time.monotonic(), self.settings["optim"]
-        step = partial(
-            descend,
-            self.optimizer,
-            lr=annealed(self.frames, optim["lr"], optim["horizon"]),
-            max_grad_norm=optim["max_grad_norm"],
-        )
+        began = time.monotonic()
         self.algorithm.schedule(self.frames)
         batch = self.collect(batches)
         if self.heads is not None:
@@ -168,25 +164,35 @@ class Trainer:
         first, *others = self.algorithm.minibatches(batch)
         with self._precision():  # another one: autocast keeps weights that it converted without gradients
             terms = dict(self.algorithm.losses(first))
-        norm = step(total_loss(terms))
+        norm = self._descend(terms)
         for part in others:
             self.algorithm.after_step()
             with self._precision():
                 terms = dict(self.algorithm.losses(part))
-            norm = step(total_loss(terms))
+            norm = self._descend(terms)
         for _ in range(self.algorithm.replay_steps):
             with self._precision():
-                more = self.algorithm.replay_losses()
-            step(total_loss(more))
+                more = dict(self.algorithm.replay_losses())
+            self._descend(more)
             terms.update(more)
         self.algorithm.after_step()
         terms = {name: value.detach() for name, value in terms.items()} | {"grad_norm": norm}
-        self.frames += batch.numel()
+        self.frames += batch.numel() * self.ranks.size
         self.updates += 1
         self.episodes.update(batch)
         self.terms.update(terms)
         self.seconds += time.monotonic() - began
         return batch, terms
+
+    def _descend(self, terms: dict[str, Tensor]) -> Tensor:
+        """One optimizer step; gradients and terms become their means over all ranks."""
+        optim = self.settings["optim"]
+        lr = annealed(self.frames, optim["lr"], optim["horizon"])
+        average = partial(self.ranks.average, terms=terms)
+        norm = descend(self.optimizer, total_loss(terms), lr, optim["max_grad_norm"], average)
+        if self.ranks.size > 1:
+            self.algorithm.take_means(terms)
+        return norm
 
     def metrics(self) -> dict[str, float]:
         """Metrics since the last call, for a line of the log; the meters start over.
@@ -195,25 +201,35 @@ class Trainer:
             VusfaError: a weight is not finite.
         """
         self._check_weights()
+        for state in self.ranks.gather(self.episodes.state_dict())[1:]:
+            self.episodes.add(state)
         lr = self.optimizer.param_groups[0]["lr"]
         head = {"updates": float(self.updates), "seconds": self.seconds, "lr": lr}
         return head | self.episodes.flush() | self.terms.flush()
 
     def save(self, path: str | Path) -> Path:
         """Write a checkpoint atomically, within :meth:`collecting`; see :mod:`vusfa.training.checkpoint`.
+        With ranks all call this, and rank 0 writes what belongs to all.
 
         Raises:
             VusfaError: a weight is not finite; an earlier checkpoint stays as it is.
         """
         self._check_weights()
         if self._collector is None:
-            raise RuntimeError(
-                "a trainer is saved within collecting(): the environments' state belongs to it"
-            )
+            raise RuntimeError("a trainer is saved within collecting(): environments belong to its state")
         with self.whole():
-            return save_checkpoint(path, self._content(Path(path).parent, self._collector))
+            own = {
+                "algorithm": self.algorithm.state_dict(),
+                "collector": collector_state(self._collector),
+                "meter": {"episodes": self.episodes.state_dict(), "terms": self.terms.state_dict()},
+                "rng": random_state(),
+            }
+            merged = self.ranks.merge(own, self.algorithm.merge_states)
+            if self.ranks.is_first:
+                save_checkpoint(path, self._content(Path(path).parent) | merged)
+            return Path(path)
 
-    def _content(self, folder: Path, collector: BaseCollector) -> dict[str, Any]:
+    def _content(self, folder: Path) -> dict[str, Any]:
         return {
             "frames": self.frames,
             "updates": self.updates,
@@ -230,11 +246,7 @@ class Trainer:
             "overrides": without_places(list(self.overrides)),
             "agent_config": self.agent.config,
             "agent": self.agent.state_dict(),
-            "algorithm": self.algorithm.state_dict(),
             "optimizer": self.optimizer.state_dict(),
-            "collector": collector_state(collector),
-            "meter": {"episodes": self.episodes.state_dict(), "terms": self.terms.state_dict()},
-            "rng": random_state(),
         }
 
     def load_weights(self, state: Mapping[str, Any], path: str | Path = "the checkpoint") -> None:
@@ -266,11 +278,12 @@ class Trainer:
         check_fits(path, state, self.scenes, self.goals, self.agent)
         load_weights(self.agent, state, path)
         load_optimizer(self.optimizer, state, path)
+        restore(path, "rng", check_random_state, state["rng"])
+        state = self.ranks.share_of_state(path, state, self.algorithm.share_of_state)
         restore(path, "algorithm", self.algorithm.load_state_dict, state["algorithm"])
         check_like(path, "meter.episodes", state["meter"]["episodes"], self.episodes.state_dict())
         self.episodes.load_state_dict(state["meter"]["episodes"])
         restore(path, "meter.terms", self.terms.load_state_dict, state["meter"]["terms"])
-        restore(path, "rng", check_random_state, state["rng"])
         for name in ("frames", "updates", "seconds", "run_id"):
             setattr(self, name, state[name])
         self.validation = dict(state["validation"])
@@ -282,14 +295,6 @@ class Trainer:
         enabled = resolve_autocast(self.settings["autocast"], device)
         return torch.autocast(device.type, torch.bfloat16, enabled=enabled)
 
-    @torch.no_grad()
     def _check_weights(self) -> None:
-        # one number for all weights: a short batch is logged at every update
-        if torch.nn.utils.get_total_norm(self.algorithm.parameters()).isfinite():
-            return
-        wrong = [name for name, param in self.agent.named_parameters() if not param.isfinite().all()]
-        if wrong:
-            raise VusfaError(
-                f"after {self.frames:,} frames the weights {', '.join(wrong)} are not finite any more; choose"
-                " a smaller optim.lr or optim.max_grad_norm, and resume an earlier checkpoint or begin anew"
-            )
+        if self.ranks.is_first:  # they are the same on all
+            check_finite(self.algorithm.parameters(), self.agent, self.frames)
