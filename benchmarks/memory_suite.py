@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import gc
-import multiprocessing
 import resource
 from collections.abc import Sequence
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,7 +12,7 @@ import psutil
 import torch
 
 from benchmarks.report import Options, Report, Requirement, Row
-from benchmarks.trainer import running, small
+from benchmarks.trainer import apart, running, small
 
 __all__ = ["bytes_a_frame", "growth", "peak", "peak_so_far", "run"]
 
@@ -31,16 +29,16 @@ def run(options: Options) -> Report:
         "features": ["agent.model=vusfa", "agent.observation=features", *tiny],
     }
     for place, more in (("collector", []), ("worker pipes", ["collector=multi_sync"])):
-        size = {kind: _apart(bytes_a_frame, [*given, *more]) for kind, given in kinds.items()}
+        size = {kind: apart(bytes_a_frame, [*given, *more]) for kind, given in kinds.items()}
         times = size["features"] / size["ids"]
         report.rows.append(Row(f"{place}: a frame as ids", size["ids"], "bytes", "features", times))
         report.rows.append(Row(f"{place}: a frame as features", size["features"], "bytes"))
-    most = {kind: _apart(peak, given, 1 if options.quick else 5) for kind, given in kinds.items()}
+    most = {kind: apart(peak, given, 1 if options.quick else 5) for kind, given in kinds.items()}
     times = most["features"] / most["ids"]
     report.rows.append(Row("peak resident memory of a training", most["ids"], "MiB", "features", times))
     report.rows.append(Row("peak resident memory, features", most["features"], "MiB"))
     updates = 20 if options.quick else 10_000
-    grown = _apart(growth, small(replace(options, quick=True)), updates)
+    grown = apart(growth, small(replace(options, quick=True)), updates)
     report.rows.append(Row(f"growth over {updates:,} updates", grown, "MiB", note="of a tiny network"))
     if not options.quick:
         what = f"growth of resident memory over {updates:,} updates"
@@ -85,11 +83,3 @@ def growth(overrides: Sequence[str], updates: int) -> float:
         gc.collect()
         after = own.memory_info().rss
     return (after - before) / 2**20
-
-
-def _apart(function: object, *arguments: object) -> float:
-    """Compute the function's result in its own process."""
-    context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload(["benchmarks.trainer"])  # imported once, for all
-    with ProcessPoolExecutor(1, mp_context=context) as pool:
-        return pool.submit(function, *arguments).result()  # type: ignore[arg-type]

@@ -6,6 +6,7 @@ The exit code is 1 when a requirement fails, except with --quick, whose numbers 
 
 from __future__ import annotations
 
+import multiprocessing
 import sys
 from dataclasses import replace
 from enum import StrEnum
@@ -83,6 +84,7 @@ def main(
     if quick:
         options = replace(options, repetitions=1, seconds=0.0)
     keep_memory()  # as in the recipes, and for the peers, too
+    multiprocessing.set_forkserver_preload(["benchmarks.trainer"])  # imported once, for all processes
     console, machine = Console(), describe_machine()
     machine["foreign_load"] = round(foreign_load(), 2)
     print_machine(machine, console)

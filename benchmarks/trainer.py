@@ -6,7 +6,9 @@ The settings are the recipe's own, composed from ``vusfa/conf`` as its command l
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+import multiprocessing
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
@@ -19,7 +21,7 @@ from vusfa.cli.launch import compose
 from vusfa.scenes import SceneSet
 from vusfa.training import Trainer, make_trainer
 
-__all__ = ["Running", "recipe_settings", "running", "small"]
+__all__ = ["Running", "apart", "recipe_settings", "running", "small"]
 
 
 def recipe_settings(overrides: Sequence[str] = ()) -> DictConfig:
@@ -66,6 +68,13 @@ def running(overrides: Sequence[str] = (), scenes: SceneSet | None = None) -> It
     trainer = make_trainer(settings, scenes=scenes)
     with trainer.collecting() as batches:
         yield Running(trainer, batches)
+
+
+def apart(function: Callable[..., Any], *arguments: object) -> Any:
+    """Compute a function's result in a process of its own."""
+    context = multiprocessing.get_context("forkserver")
+    with ProcessPoolExecutor(1, mp_context=context) as pool:
+        return pool.submit(function, *arguments).result()
 
 
 def small(options: Options) -> list[str]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import json
+import multiprocessing
 import os
 import signal
 import subprocess
@@ -176,14 +177,72 @@ def settings() -> Callable[..., DictConfig]:
     return made
 
 
+# Processes begin with what takes seconds to import: they are forked from one server per process of pytest.
+multiprocessing.set_forkserver_preload(
+    [
+        "typer",
+        "vusfa.cli.launch",
+        "vusfa.experiments.training",
+        "vusfa.report.command",
+        "vusfa.sources.capture",
+    ]
+)
+
+
 @pytest.fixture
 def fast_workers() -> Iterator[None]:
     """Workers are forked from a server that has imported everything, instead of importing it each."""
     before = torch.multiprocessing.get_start_method(allow_none=True)
-    torch.multiprocessing.set_forkserver_preload(["vusfa.training"])
     torch.multiprocessing.set_start_method("forkserver", force=True)
     yield
     torch.multiprocessing.set_start_method(before, force=True)
+
+
+_PROGRAM = """
+import os, sys, types
+os.setsid()
+os.environ.clear()
+os.environ.update(environment)
+os.chdir(folder)
+for number, path in enumerate(outputs, 1):
+    os.dup2(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC), number)
+sys.stdout, sys.stderr = (open(number, "w", closefd=False) for number in (1, 2))
+sys.argv = arguments
+sys.path.insert(0, os.path.dirname(arguments[0]))
+sys.modules["__main__"] = main = types.ModuleType("__main__")
+main.__file__ = arguments[0]
+exec(compile(code, arguments[0], "exec"), vars(main))
+"""
+
+
+@pytest.fixture(scope="session")
+def program(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., subprocess.CompletedProcess[str]]:
+    """``program("examples/a.py", "b", folder=tmp_path)`` runs a script of the repository, or ``code`` in its
+    place, in a process of its own: as ``python examples/a.py b`` does, but for the seconds of imports."""
+    context, root = multiprocessing.get_context("forkserver"), Path(__file__).parents[1]
+
+    def run(
+        script: str, *arguments: object, folder: Path, code: str = "", seconds: float = 500.0
+    ) -> subprocess.CompletedProcess[str]:
+        path = str(root / script)
+        outputs = [tmp_path_factory.mktemp("program") / name for name in ("out", "err")]
+        given = {
+            "arguments": [path, *map(str, arguments)],
+            "code": code or Path(path).read_text(encoding="utf-8"),
+            "environment": dict(os.environ),
+            "folder": str(folder),
+            "outputs": [str(output) for output in outputs],
+        }
+        process = context.Process(target=exec, args=(_PROGRAM, given))
+        process.start()
+        process.join(seconds)
+        if process.exitcode is None and process.pid is not None:
+            os.killpg(process.pid, signal.SIGKILL)  # a child that hangs, too
+            process.join()
+        out, err = (output.read_text(encoding="utf-8") for output in outputs)
+        return subprocess.CompletedProcess(given["arguments"], process.exitcode, out, err)
+
+    return run
 
 
 @pytest.fixture

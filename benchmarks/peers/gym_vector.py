@@ -45,7 +45,7 @@ def parallel_env(workers: int, quick: bool, stack: ExitStack) -> Callable[[], in
 def async_vector(workers: int, quick: bool, stack: ExitStack) -> Callable[[], int]:
     """Gymnasium's AsyncVectorEnv with random actions."""
     steps = 20 if quick else 200
-    envs = AsyncVectorEnv([partial(make_gym, quick)] * workers, context="spawn")
+    envs = AsyncVectorEnv([partial(make_gym, quick)] * workers)
     stack.callback(envs.close)
     envs.reset(seed=0)
     rng = np.random.default_rng(0)

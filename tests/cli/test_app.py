@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -62,8 +63,10 @@ def test_errors_of_the_program_are_not_hidden(
 
 
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
-def test_a_signal_ends_a_process_that_cleans_up(number: signal.Signals, code: int) -> None:
-    program = f"""
+def test_a_signal_ends_a_process_that_cleans_up(
+    number: signal.Signals, code: int, program: Callable[..., Any], tmp_path: Path
+) -> None:
+    text = f"""
 import os, time, vusfa.scenes, vusfa.cli
 def hang(path):
     try:
@@ -74,7 +77,7 @@ def hang(path):
 vusfa.scenes.validate = hang
 vusfa.cli.main(["scenes", "check", "x.h5"])
 """
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60)
+    done = program("vusfa", folder=tmp_path, code=text)
     assert (done.returncode, done.stdout) == (code, "cleaned up\n"), done.stderr
     assert "Traceback" not in done.stderr
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 from pathlib import Path
 from typing import Literal
 
@@ -67,10 +65,3 @@ def test_all_have_help(
         main([name, "--help"])
     assert not ended.value.code
     assert f"Usage: vusfa {name}" in capsys.readouterr().out
-
-
-def test_help_of_a_process() -> None:
-    line = [sys.executable, "-m", "vusfa.cli", "table1", "--help"]
-    done = subprocess.run(line, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
-    assert "Usage: vusfa table1" in done.stdout

@@ -145,7 +145,7 @@ def test_check_looks_into_folders(run: Run, tmp_path: Path, scene_file: Path) ->
     done = run("check", scene_file.parent)
     assert (done.exit_code, done.stdout) == (0, f"{scene_file}: sound\n")
     (tmp_path / "empty").mkdir()
-    assert "has no scene files in it" in run("check", tmp_path / "empty").stderr
+    assert "there are no scene files" in run("check", tmp_path / "empty").stderr
 
 
 WRITING = {

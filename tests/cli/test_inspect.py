@@ -84,6 +84,8 @@ def test_list_looks_into_folders(
         file["something"] = [1]
     names = [Path(row["file"]).name for row in json.loads(run("list", folder, "--json").stdout)]
     assert names == ["a.h5", "b.hdf5"]
+    names = [Path(row["file"]).name for row in json.loads(run("list", f"{folder}/*.h5", "--json").stdout)]
+    assert names == ["a.h5"]
     monkeypatch.chdir(folder)
     names = [row["name"] for row in json.loads(run("list", "--json").stdout)]
     assert names == ["bathroom", "bedroom", "kitchen", "living_room", "hall", "hall"]
@@ -104,7 +106,7 @@ def test_list_goes_on_after_a_faulty_file(run: Run, scene_file: Path, faulty_fil
     ("source", "message"),
     [
         ("attic", "'attic' is neither a bundled scene (bathroom, bedroom, kitchen, living_room) nor a file"),
-        ("", "has no scene files in it; they end in .h5 or .hdf5"),
+        ("", "there are no scene files (.h5, .hdf5); check the path"),
         ("gone.h5", "there is no such file"),
     ],
 )

@@ -82,9 +82,10 @@ def test_collectors_store_and_load_it_strictly(make_env: Callable[[], TargetNavE
     collector.shutdown()
 
 
+@pytest.mark.usefixtures("fast_workers")
 @pytest.mark.parametrize("kind", [MultiSyncCollector, MultiAsyncCollector])
 def test_workers_draw_apart_and_reproducibly(kind: Any, make_env: Callable[[], TargetNavEnv]) -> None:
-    """Workers are spawned; each gets a seed of its own through set_seed."""
+    """Each worker gets a seed of its own through set_seed."""
     with warnings.catch_warnings():
         # Python's own multiprocessing may find a pipe's end closed while the workers shut down.
         warnings.simplefilter("default", ResourceWarning)

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import csv
-import subprocess
-import sys
 from pathlib import Path
+from typing import Any
 
 import torch
 
@@ -19,14 +18,12 @@ from vusfa.scenes import SceneSet
 EXAMPLE = Path(__file__).parents[2] / "examples" / "extending" / "metric.py"
 
 
-def command(*arguments: object) -> str:
-    line = [sys.executable, str(EXAMPLE), *map(str, arguments)]
-    done = subprocess.run(line, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
-    return done.stdout
+def test_it_appears_everywhere(scene_file: Path, tmp_path: Path, program: Any) -> None:
+    def command(*arguments: object) -> str:
+        done = program("examples/extending/metric.py", *arguments, folder=tmp_path)
+        assert done.returncode == 0, done.stderr
+        return done.stdout
 
-
-def test_it_appears_everywhere(scene_file: Path, tmp_path: Path) -> None:
     overrides = ["agent.hidden_size=8", "agent.embedding_size=8", "agent.history=1", "total_frames=48"]
     overrides += [f"scenes=[{scene_file}]", "env.goals=[3,9]", "collector.num_envs=6", "collector.rollout=4"]
     train(compose_settings([*overrides, "evaluation=none", f"folder={tmp_path / 'run'}"]), overrides)

@@ -2,21 +2,18 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 from pathlib import Path
+from typing import Any
 
 from vusfa.scenes import Scene, validate
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "extending" / "scene_source.py"
 
 
-def command(*arguments: object) -> subprocess.CompletedProcess[str]:
-    line = [sys.executable, str(EXAMPLE), *map(str, arguments)]
-    return subprocess.run(line, capture_output=True, text=True, check=False)
+def test_a_grid_world_is_a_scene(tmp_path: Path, program: Any) -> None:
+    def command(*arguments: object) -> Any:
+        return program("examples/extending/scene_source.py", *arguments, folder=tmp_path)
 
-
-def test_a_grid_world_is_a_scene(tmp_path: Path) -> None:
     target = tmp_path / "maze.h5"
     done = command("grid-world", target, "--columns", 4, "--rows", 3)
     assert (done.returncode, done.stdout) == (0, f"{target}: 40 states\n"), done.stderr

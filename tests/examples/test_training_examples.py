@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import csv
 import runpy
-import subprocess
-import sys
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -18,11 +18,17 @@ from vusfa.training import load_agent, load_checkpoint
 EXAMPLES = Path(__file__).parents[2] / "examples" / "extending"
 
 
-def start(example: str, *overrides: str, folder: Path) -> str:
-    command = [sys.executable, str(EXAMPLES / f"{example}.py"), *overrides, f"folder={folder}"]
-    done = subprocess.run(command, cwd=folder.parent, capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
-    return done.stderr
+@pytest.fixture
+def start(program: Any) -> Callable[..., None]:
+    """Runs an example, which has to succeed."""
+
+    def run(example: str, *overrides: str, folder: Path) -> None:
+        done = program(
+            f"examples/extending/{example}.py", *overrides, f"folder={folder}", folder=folder.parent
+        )
+        assert done.returncode == 0, done.stderr
+
+    return run
 
 
 @pytest.mark.parametrize(
@@ -37,6 +43,7 @@ def test_trained_resumed_and_evaluated(
     scene_file: Path,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
+    start: Callable[..., None],
     example: str,
     chosen: list[str],
     column: str,
@@ -76,13 +83,15 @@ def test_trained_resumed_and_evaluated(
     load_agent(path)
 
 
-def test_what_a_script_does_not_register_is_refused(scene_file: Path, tmp_path: Path):
+def test_what_a_script_does_not_register_is_refused(
+    scene_file: Path, tmp_path: Path, start: Callable[..., None], program: Any
+):
     """A checkpoint names an algorithm; nothing is imported for it."""
     sizes = ["agent.hidden_size=8", "agent.embedding_size=8", "collector.num_envs=5", "collector.rollout=4"]
     more = ["algorithm=ppo", f"scenes=[{scene_file}]", "total_frames=20", "evaluation=none"]
     start("algorithm", *sizes, *more, "env.goals=[3,9,12]", folder=tmp_path / "run")
-    command = [sys.executable, str(EXAMPLES / "loss_term.py"), f"resume={tmp_path / 'run' / 'checkpoint.pt'}"]
-    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
+    resume = f"resume={tmp_path / 'run' / 'checkpoint.pt'}"
+    done = program("examples/extending/loss_term.py", resume, folder=tmp_path)
     assert done.returncode == 2
     assert "algorithm.name is 'ppo': no such algorithm is registered" in done.stderr
     assert done.stderr.count("\n") == 1

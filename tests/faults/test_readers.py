@@ -6,14 +6,10 @@ More of the same: ``python tests/faults/worker.py SEED CASES``.
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
-from pathlib import Path
 from typing import Any
 
 import pytest
 
-HERE = Path(__file__).parent
 NAMES = [
     "checkpoint", "agent",
     "scene", "scene, raw", "compact", "fetch", "archives", "picture", "features", "poses", "edges", "row log",
@@ -24,10 +20,9 @@ CASES = 40
 
 
 @pytest.fixture(scope="module")
-def results() -> dict[str, dict[str, Any]]:
-    """What the readers did, by name; all in one process, which takes most of its time to start."""
-    command = [sys.executable, str(HERE / "worker.py"), "0", str(CASES)]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=500)
+def results(program: Any, tmp_path_factory: pytest.TempPathFactory) -> dict[str, dict[str, Any]]:
+    """What the readers did, by name; all in one process."""
+    done = program("tests/faults/worker.py", 0, CASES, folder=tmp_path_factory.mktemp("readers"))
     lines = [json.loads(line) for line in done.stdout.splitlines()]
     assert done.returncode == 0, f"died after: {done.stderr[-3000:]}"
     return {line["reader"]: line for line in lines}

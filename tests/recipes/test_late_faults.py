@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import csv
 import signal
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -159,16 +157,18 @@ def test_zero_shot_looks_first_where_to_write(recipe, tmp_path: Path):
         zero_shot(Path("/etc/passwd"), out=tmp_path / "x")
 
 
-def test_zero_shot_interrupted(recipe, settings, small, tmp_path: Path):
+def test_zero_shot_interrupted(recipe, settings, small, tmp_path: Path, program):
     recipe("train").train(settings(*small, "total_frames=24", f"folder={tmp_path / 'run'}"), [])
-    code = (
-        "import runpy, sys, vusfa.evaluation.comparison as c\n"
-        "def interrupt(*a, **k): raise KeyboardInterrupt\n"
-        "c.evaluate = interrupt\n"
-        f"sys.argv = ['zero_shot.py', {str(tmp_path / 'run' / 'checkpoint.pt')!r}]\n"
-        f"runpy.run_path({str(RECIPES / 'zero_shot.py')!r}, run_name='__main__')\n"
-    )
-    done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True)
+    code = """
+import vusfa.evaluation.comparison
+from vusfa.cli.functions import run_functions
+def interrupt(*_, **__): raise KeyboardInterrupt
+vusfa.evaluation.comparison.evaluate = interrupt
+from zero_shot import zero_shot
+run_functions(zero_shot)
+"""
+    path = tmp_path / "run" / "checkpoint.pt"
+    done = program("recipes/zero_shot.py", path, folder=tmp_path, code=code)
     assert done.returncode == 128 + signal.SIGINT
     assert done.stderr.splitlines()[-1] == "error: interrupted; nothing has been written"
     assert "Traceback" not in done.stderr

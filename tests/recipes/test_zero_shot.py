@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import csv
 import json
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -16,8 +14,6 @@ from vusfa.errors import ResultError
 from vusfa.experiments.manifest import make_manifest, write_manifest
 from vusfa.experiments.runs import read_run
 from vusfa.scenes import SceneSet
-
-ZERO_SHOT = Path(__file__).parents[2] / "recipes" / "zero_shot.py"
 
 
 @pytest.mark.parametrize("model", ["gvf", "usfa", "sfdp", "vusfa"])
@@ -93,10 +89,8 @@ def test_the_episodes_of_a_manifest(recipe, tmp_path: Path):
         recipe("zero_shot").zero_shot(checkpoint, manifest="bundled")
 
 
-def test_as_a_command(tmp_path: Path):
-    done = subprocess.run(
-        [sys.executable, str(ZERO_SHOT), "none.pt"], cwd=tmp_path, capture_output=True, text=True
-    )
+def test_as_a_command(tmp_path: Path, program):
+    done = program("recipes/zero_shot.py", "none.pt", folder=tmp_path)
     assert done.returncode == 1
     assert done.stderr.startswith("error: none.pt: no such checkpoint")
     assert done.stderr.count("\n") == 1

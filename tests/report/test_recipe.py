@@ -2,20 +2,23 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
+from typing import Any
 
-REPORT = Path(__file__).parents[2] / "recipes" / "report.py"
-
-
-def call(*arguments: object) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, str(REPORT), *map(str, arguments)], capture_output=True, text=True, check=False
-    )
+import pytest
 
 
-def test_page_tables_and_wandb(run_folders: list[Path], tmp_path: Path, wandb_records):
+@pytest.fixture
+def call(program: Callable[..., Any], tmp_path: Path) -> Callable[..., Any]:
+    """The program."""
+    return partial(program, "recipes/report.py", folder=tmp_path)
+
+
+def test_page_tables_and_wandb(
+    call: Callable[..., Any], run_folders: list[Path], tmp_path: Path, wandb_records
+):
     options = ["--goals-per-scene", 2, "--walks", 1, "--max-steps", 5, "--wandb", "offline"]
     done = call(f"ours={run_folders[0]}", run_folders[2], "--out", tmp_path / "page.html", *options)
     assert done.returncode == 0, done.stderr
@@ -29,7 +32,7 @@ def test_page_tables_and_wandb(run_folders: list[Path], tmp_path: Path, wandb_re
     assert {"summary", "seeds", "distance", "goals", "runs"} <= logged
 
 
-def test_faults_in_one_line(tmp_path: Path):
+def test_faults_in_one_line(call: Callable[..., Any], tmp_path: Path):
     done = call(tmp_path / "none", "--out", tmp_path / "page.html")
     assert done.returncode == 1
     assert (

@@ -1,15 +1,11 @@
 from __future__ import annotations
 
-import contextlib
 import copy
 import multiprocessing
-import os
 import pickle
-import signal
-import subprocess
-import sys
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -231,13 +227,11 @@ os._exit(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))
 """
 
 
-def test_rooms_open_in_a_fork_of_a_process_that_has_computed() -> None:
-    process = subprocess.Popen([sys.executable, "-c", LOAD_AFTER_FORK], start_new_session=True)
-    try:
-        assert process.wait(60) == 0
-    finally:
-        with contextlib.suppress(ProcessLookupError):
-            os.killpg(process.pid, signal.SIGKILL)  # a child that hangs too
+def test_rooms_open_in_a_fork_of_a_process_that_has_computed(
+    program: Callable[..., Any], tmp_path: Path
+) -> None:
+    done = program("vusfa", folder=tmp_path, code=LOAD_AFTER_FORK, seconds=60.0)
+    assert done.returncode == 0, done.stderr
 
 
 @pytest.mark.parametrize(

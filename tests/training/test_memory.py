@@ -9,12 +9,12 @@ import sys
 
 import pytest
 
-from vusfa.training.memory import keep_memory
+from vusfa.training import memory
 
 # what the C library counts of its own blocks: how large they are does not hang on pages or on other programs
 PROGRAM = """
-import ctypes, json, sys, torch
-from vusfa.training.memory import keep_memory
+import ctypes, json, runpy, sys
+keep_memory = runpy.run_path(sys.argv[2])["keep_memory"]
 library = ctypes.CDLL(None)
 names = "arena ordblks smblks hblks hblkhd usmblks fsmblks uordblks fordblks keepcost".split()
 class Info(ctypes.Structure):
@@ -23,7 +23,7 @@ library.mallinfo2.restype = Info
 if sys.argv[1] == "keep":
     assert keep_memory()
 before = library.mallinfo2()
-block = torch.ones(7_500_000)
+block = bytearray(30_000_000)
 held = library.mallinfo2()
 del block
 freed = library.mallinfo2()
@@ -36,12 +36,11 @@ print(json.dumps({
 
 
 def counted(how: str) -> dict[str, int]:
-    return json.loads(
-        subprocess.run([sys.executable, "-c", PROGRAM, how], capture_output=True, check=True).stdout
-    )
+    command = [sys.executable, "-c", PROGRAM, how, memory.__file__]
+    return json.loads(subprocess.run(command, capture_output=True, check=True).stdout)
 
 
-@pytest.mark.skipif(not keep_memory(), reason="the C library is not glibc")
+@pytest.mark.skipif(not memory.keep_memory(), reason="the C library is not glibc")
 @pytest.mark.skipif(
     not hasattr(ctypes.CDLL(None), "mallinfo2"), reason="glibc before 2.33 counts its blocks in 32 bits"
 )

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from vusfa.cli.sources import scene_paths, scenes_in
+from vusfa.cli.sources import has_graph, scene_paths
 from vusfa.errors import SceneError, printable
 
 if TYPE_CHECKING:
@@ -54,11 +54,13 @@ def list_scenes(
     from vusfa.cli.progress import progress
     from vusfa.cli.tables import print_wide, table_of_groups, table_of_scenes
     from vusfa.scenes import Scene, bundled_names
+    from vusfa.scenes.places import files_in
     from vusfa.scenes.store import bundled_path
     from vusfa.sources.summary import by_name, summarize
 
     bundled = {name: bundled_path(name) for name in bundled_names()}
-    paths = scene_paths(sources) if sources else [*bundled.values(), *scenes_in(Path())]
+    here = map(Path, filter(has_graph, files_in(".")))
+    paths = scene_paths(sources) if sources else [*bundled.values(), *here]
     rows: list[tuple[Path, Summary | SceneError]] = []
     with progress("measuring", len(paths), "scenes") as advance:
         for path in paths:

@@ -10,7 +10,7 @@ import typer
 
 from vusfa.errors import ConfigError, SceneError
 
-__all__ = ["Force", "check_target", "say_next", "scene_path", "scene_paths", "scenes_in"]
+__all__ = ["Force", "check_target", "has_graph", "say_next", "scene_path", "scene_paths"]
 
 #: The option of commands that write a file.
 Force = Annotated[bool, typer.Option("--force", help="Replace the file if it exists.")]
@@ -63,39 +63,22 @@ def scene_path(source: str | Path) -> Path:
 
 
 def scene_paths(sources: Sequence[str]) -> list[Path]:
-    """Scene files of names, files and folders, each once.
+    """Scene files of names, files, folders and patterns, each once; of a folder's files those with a graph.
 
     Raises:
-        SceneError: a name is unknown, or a folder has no scene files.
+        SceneError: a name is unknown, a folder has no scene files, or no file matches a pattern.
     """
-    from vusfa.scenes.places import SUFFIXES
+    from vusfa.scenes.places import expanded
 
-    found: dict[Path, None] = {}
-    for source in sources:
-        if Path(source).is_dir():
-            inside = scenes_in(Path(source))
-            if not inside:
-                raise SceneError(f"{source}: has no scene files in it; they end in {' or '.join(SUFFIXES)}")
-            found.update(dict.fromkeys(inside))
-        else:
-            found[scene_path(source)] = None
-    return list(found)
+    return list(dict.fromkeys(map(scene_path, expanded(sources, has_graph))))
 
 
-def scenes_in(folder: Path) -> list[Path]:
-    """Files of a folder that may be scenes; HDF5 files without a graph are skipped."""
+def has_graph(path: str | Path) -> bool:
+    """Whether an HDF5 file has a scene's graph; true of a damaged file, whose fault is reported later."""
     from vusfa.scenes.hdf5 import opened
-    from vusfa.scenes.places import SUFFIXES
 
-    found = []
-    for path in sorted(folder.iterdir()):
-        if path.suffix not in SUFFIXES or not path.is_file() or path.name.startswith("."):
-            continue
-        try:
-            with opened(path) as file:
-                is_scene = file.get("graph", getlink=True) is not None
-        except SceneError:
-            is_scene = True  # its fault is reported later
-        if is_scene:
-            found.append(path)
-    return found
+    try:
+        with opened(Path(path)) as file:
+            return file.get("graph", getlink=True) is not None
+    except SceneError:
+        return True

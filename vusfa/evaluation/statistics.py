@@ -172,7 +172,7 @@ def _weighted(sums: Sums, scene: Tensor, draws: Draws, by_scene: bool) -> Tensor
     return torch.stack(ratios).nanmean(0)
 
 
-def bootstrap_mean(sums: Sums, scene: Tensor, *, level: float = 0.95, **options: Any) -> Estimate:
+def bootstrap_mean(sums: Sums, scene: Tensor, **options: Any) -> Estimate:
     """A mean over seeds and goals with its interval; see :func:`crossed_draws` for the arguments.
 
     >>> sums = Sums(torch.tensor([[0.0, 1.0], [0.0, 1.0]]), torch.ones(2, 2))
@@ -180,18 +180,16 @@ def bootstrap_mean(sums: Sums, scene: Tensor, *, level: float = 0.95, **options:
     Estimate(value=0.5, low=0.5, high=0.5)
     """
     value, drawn = crossed_draws(sums, scene, **options)
-    return interval(value, drawn, level)
+    return interval(value, drawn)
 
 
-def paired_difference(
-    first: Sums, second: Sums, scene: Tensor, *, level: float = 0.95, **options: Any
-) -> Estimate:
+def paired_difference(first: Sums, second: Sums, scene: Tensor, **options: Any) -> Estimate:
     """The first mean less the second, with its interval: in every resample both have the same seeds and the
     same goals.
 
     Args:
         first, second: (K, G), rows of the same seeds and columns of the same goals.
-        scene, level, options: see :func:`crossed_draws`.
+        scene, options: see :func:`crossed_draws`.
 
     >>> sums = Sums(torch.rand(3, 5), torch.ones(3, 5))
     >>> better = Sums(sums.numerator + 1, sums.denominator)
@@ -204,7 +202,7 @@ def paired_difference(
             f" {tuple(first.numerator.shape)} and {tuple(second.numerator.shape)}"
         )
     (one, ones), (two, twos) = (crossed_draws(sums, scene, **options) for sums in (first, second))
-    return interval(one - two, ones - twos, level)
+    return interval(one - two, ones - twos)
 
 
 def interquartile_mean(scores: Tensor) -> Tensor:
@@ -222,21 +220,21 @@ def interquartile_mean(scores: Tensor) -> Tensor:
     return scores.sort(-1).values[..., cut : size - cut].mean(-1)
 
 
-def bootstrap_iqm(scores: Tensor, *, level: float = 0.95, resamples: int = 2000, seed: int = 0) -> Estimate:
+def bootstrap_iqm(scores: Tensor, *, resamples: int = 2000) -> Estimate:
     """The interquartile mean over seeds and scenes, seeds drawn again within each scene.
 
     Args:
         scores: (K, T), of K seeds in T scenes.
-        level, resamples, seed: of the interval and its draws.
+        resamples: of the interval.
 
     >>> bootstrap_iqm(torch.tensor([[0.5, 0.25], [0.5, 0.25]])).value
     0.375
     """
-    drawn = _redrawn(scores.to(torch.float64), resamples, torch.Generator().manual_seed(seed))
+    drawn = _redrawn(scores.to(torch.float64), resamples, torch.Generator().manual_seed(0))
     value = interquartile_mean(scores.to(torch.float64).flatten()).item()
     if len(scores) == 1:
         return Estimate(value, math.nan, math.nan)
-    return interval(value, interquartile_mean(drawn.flatten(1)), level)
+    return interval(value, interquartile_mean(drawn.flatten(1)))
 
 
 def improvement(first: Tensor, second: Tensor) -> Tensor:
@@ -257,15 +255,13 @@ def improvement(first: Tensor, second: Tensor) -> Tensor:
     return ((gap > 0).to(torch.float64) + 0.5 * (gap == 0).to(torch.float64)).mean((-3, -2, -1))
 
 
-def bootstrap_improvement(
-    first: Tensor, second: Tensor, *, level: float = 0.95, resamples: int = 2000, seed: int = 0
-) -> Estimate:
+def bootstrap_improvement(first: Tensor, second: Tensor, *, resamples: int = 2000) -> Estimate:
     """:func:`improvement` with its interval; both models' seeds are drawn again, each within its scenes.
 
     Args:
         first: (K, T).
         second: (L, T), the same scenes.
-        level, resamples, seed: of the interval and its draws.
+        resamples: of the interval.
 
     >>> bootstrap_improvement(torch.tensor([[2.0], [3.0]]), torch.tensor([[0.0], [1.0]]))
     Estimate(value=1.0, low=1.0, high=1.0)
@@ -274,12 +270,12 @@ def bootstrap_improvement(
         raise ConfigError(
             f"scores are of {first.shape[1]} and {second.shape[1]} scenes; give both of the same scenes"
         )
-    generator = torch.Generator().manual_seed(seed)
+    generator = torch.Generator().manual_seed(0)
     one, two = (_redrawn(scores.to(torch.float64), resamples, generator) for scores in (first, second))
     value = improvement(first, second).item()
     if len(first) == 1 or len(second) == 1:
         return Estimate(value, math.nan, math.nan)
-    return interval(value, improvement(one, two), level)
+    return interval(value, improvement(one, two))
 
 
 def _redrawn(scores: Tensor, resamples: int, generator: torch.Generator) -> Tensor:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import warnings
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from glob import glob
 from pathlib import Path
 from typing import Any
@@ -14,7 +14,7 @@ from vusfa.errors import SceneError
 from vusfa.limits import LAZY_SCENES, MAX_FAULTS
 from vusfa.scenes.scene import Scene
 
-__all__ = ["SUFFIXES", "Sources", "expanded", "listed", "open_scenes"]
+__all__ = ["Sources", "expanded", "files_in", "listed", "open_scenes"]
 
 #: Names and paths of scenes, folders and patterns, one or several.
 Sources = str | os.PathLike[str] | Sequence[str | os.PathLike[str]]
@@ -23,9 +23,13 @@ Sources = str | os.PathLike[str] | Sequence[str | os.PathLike[str]]
 SUFFIXES = (".h5", ".hdf5")
 
 
-def expanded(scenes: Sources) -> list[Any]:
+def expanded(scenes: Sources, keep: Callable[[str], bool] = lambda path: True) -> list[Any]:
     """Names and files, in order: a folder (``rooms/``) stands for its files ``*.h5`` and ``*.hdf5``, and a
     pattern (``rooms/*_small.h5``) for the files that match it, both sorted by name.
+
+    Args:
+        scenes: names, files, folders and patterns.
+        keep: whether a file of a folder or a pattern counts.
 
     Raises:
         SceneError: a folder has no scene files, or no file matches a pattern.
@@ -37,15 +41,23 @@ def expanded(scenes: Sources) -> list[Any]:
     for source in listed(scenes):
         text = os.fspath(source)
         if os.path.isdir(text):
-            inside = sorted(entry.path for entry in os.scandir(text) if Path(entry.name).suffix in SUFFIXES)
+            inside = files_in(text)
         elif any(sign in text for sign in "*?[") and not os.path.lexists(text):
             inside = sorted(glob(text, recursive=True))
         else:
-            inside = [source]
+            found.append(source)
+            continue
+        inside = list(filter(keep, inside))
         if not inside:
             raise SceneError(f"{text}: there are no scene files ({', '.join(SUFFIXES)}); check the path")
         found += inside
     return found
+
+
+def files_in(folder: str) -> list[str]:
+    """Files of a folder whose names end as those of scenes do, sorted."""
+    entries = (entry for entry in os.scandir(folder) if not entry.name.startswith("."))
+    return sorted(entry.path for entry in entries if Path(entry.name).suffix in SUFFIXES)
 
 
 def open_scenes(
