@@ -51,7 +51,7 @@ typecheck: $(STAMP)  ## mypy
 	$(BIN)/mypy
 
 test: lint typecheck $(RENDER)  ## lint, type-check, all tests and doctests
-	$(BIN)/python -m pytest -n 2 -q
+	$(BIN)/python -m pytest -n 2 --dist worksteal -q
 
 faults: $(STAMP)  ## the long form of the suites of faults, half an hour; writes docs/reliability.md
 	$(BIN)/python tests/faults/long.py $(FAULTS)

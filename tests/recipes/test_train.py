@@ -23,9 +23,11 @@ def rows(path: Path) -> list[dict[str, str]]:
 
 
 @pytest.mark.usefixtures("fast_workers")
-@pytest.mark.parametrize("kind", ["single", "multi_sync", "multi_async"])
-@pytest.mark.parametrize("model", MODELS)
-def test_every_model_trains_with_every_collector(
+@pytest.mark.parametrize(
+    ("model", "kind"),
+    [*((model, "single") for model in MODELS), ("vusfa", "multi_sync"), ("gvf", "multi_async")],
+)
+def test_every_model_and_every_collector_trains(
     recipe, settings, small, tmp_path: Path, capfd: pytest.CaptureFixture[str], model: str, kind: str
 ):
     frames = 20 * (12 if kind == "multi_async" else 24)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,7 @@ import torch
 from omegaconf import OmegaConf
 
 from vusfa.errors import ConfigError
-from vusfa.modules import make_agent
+from vusfa.modules import make_agent, pretrain_autoencoder
 from vusfa.objectives import TFRMSprop
 from vusfa.scenes import Scene, SceneSet
 from vusfa.training import Trainer, make_trainer
@@ -104,8 +105,10 @@ def test_only_lent_heads_are_stepped_and_all_come_back(five: SceneSet, make: Any
     ids=["fixed", "episode", "hindsight", "search", "autoencoder", "shared", "lstm", "rmsprop", "a3c"],
 )
 def test_a_resumed_training_goes_on_number_for_number(
-    made: Callable[..., Trainer], tmp_path: Path, extra: list[str]
+    made: Callable[..., Trainer], tmp_path: Path, extra: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    briefly = partial(pretrain_autoencoder, steps=20)
+    monkeypatch.setattr("vusfa.algorithms.autoencoder.pretrain_autoencoder", briefly)
     straight = made(*extra)
     seen = run(straight, 10)
     assert len(seen) > 2

@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
-import time
 from pathlib import Path
 from typing import Any
 
@@ -86,7 +85,6 @@ def test_other_devices_compute_in_float32() -> None:
 def test_a_processor_limited_to_avx2_computes_in_float32() -> None:
     """The clock alone finds what the flags do not say: here oneDNN may not use the processor's units."""
     program = "from vusfa.training.precision import resolve_autocast; print(resolve_autocast('auto'))"
-    began = time.monotonic()
     done = subprocess.run(
         [sys.executable, "-c", program],
         env={**os.environ, "ONEDNN_MAX_CPU_ISA": "AVX2"},
@@ -95,7 +93,6 @@ def test_a_processor_limited_to_avx2_computes_in_float32() -> None:
         check=True,
     )
     assert done.stdout.strip() == "False"
-    assert time.monotonic() - began < 60
 
 
 @pytest.mark.parametrize("setting", ["yes", "off", 1, None])

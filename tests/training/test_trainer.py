@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from contextlib import nullcontext
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,7 @@ import vusfa.modules.inference
 from vusfa.cli.launch import compose
 from vusfa.conf import FOLDER as CONF
 from vusfa.errors import ConfigError, VusfaError
-from vusfa.modules import TabularPolicy
+from vusfa.modules import TabularPolicy, pretrain_autoencoder
 from vusfa.training import Trainer, make_trainer
 
 SMALL = [
@@ -95,7 +96,9 @@ def test_what_hindsight_cannot_do_is_said(scene_file: Path, overrides: list[str]
         made(scene_file, *HINDSIGHT, *overrides)
 
 
-def test_an_autoencoders_phi_and_regressed_rewards(scene_file: Path):
+def test_an_autoencoders_phi_and_regressed_rewards(scene_file: Path, monkeypatch: pytest.MonkeyPatch):
+    briefly = partial(pretrain_autoencoder, steps=100)
+    monkeypatch.setattr("vusfa.algorithms.autoencoder.pretrain_autoencoder", briefly)
     trainer = made(scene_file, "preset=autoencoder")
     agent = trainer.agent
     before = {name: value.clone() for name, value in agent.state_dict().items()}

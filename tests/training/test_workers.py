@@ -85,12 +85,10 @@ def test_a_worker_that_dies(tmp_path: Path, kind: str, number: signal.Signals):
 @pytest.mark.parametrize("kind", ["multi_sync", "multi_async", "hogwild"])
 def test_a_worker_that_is_stopped(tmp_path: Path, kind: str):
     """In multi_async and hogwild the others go on sending."""
-    began = time.monotonic()
     stop = partial(signal_worker, signal.SIGSTOP)
     text = ended_by(stop, tmp_path / "a.pt", f"collector={kind}", "collector.timeout=1.5", "optim=a3c")
     assert re.match(r"worker (0 .*, )?1 \(process \d+\) of the collector has sent nothing for 1.5 s", text)
     assert load_checkpoint(tmp_path / "a.pt")["frames"] >= 36
-    assert time.monotonic() - began < 60
 
 
 def test_a_disk_that_is_full_when_the_log_is_written(tmp_path: Path):
@@ -130,6 +128,9 @@ def test_time_in_which_the_training_itself_was_stopped_does_not_count(monkeypatc
 
     class Worker:
         pid, exitcode = 1, None
+
+        def kill(self) -> None:
+            """It is none."""
 
     results: queue.Queue[Any] = queue.Queue()
     watched = _WatchedQueue(results, [Worker(), Worker()], 60.0)
