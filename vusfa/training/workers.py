@@ -189,7 +189,13 @@ class _WatchedQueue:
         dead = _dead(self._workers)
         if dead:
             raise WorkerError(dead)
-        self._silence.check()
+        try:
+            self._silence.check()
+        except WorkerError:
+            for worker in self._workers:  # TorchRL would wait ten seconds for a stopped one
+                with suppress(ValueError):
+                    worker.kill()
+            raise
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._results, name)
