@@ -9,7 +9,7 @@ from contextlib import ExitStack
 
 from benchmarks.peers.bare_update import BareTraining
 from benchmarks.peers.feature_fed import feature_fed
-from benchmarks.report import Options, Report, Requirement, Row
+from benchmarks.report import Options, Report, Requirement, Row, counted
 from benchmarks.timing import Timing, Work, interleaved, ratio
 from benchmarks.trainer import running, small
 
@@ -35,18 +35,20 @@ def _at(size: int, options: Options, report: Report) -> None:
         bare = BareTraining(ours.trainer)
         counts = sorted({1, options.threads})
         works = {
-            f"{name}, {threads} threads": Work(call, threads)
+            f"{name}, {counted(threads, 'thread')}": Work(call, threads)
             for threads in counts
             for name, call in (("ours", ours.collect), ("bare loop", bare.collect), ("features", fed.collect))
         }
         timings = interleaved(works, options.repetitions, options.seconds)
     for threads in counts:
-        mine, label = timings[f"ours, {threads} threads"], f"{size} environments, {threads} threads"
+        many = counted(threads, "thread")
+        mine, label = timings[f"ours, {many}"], f"{size} environments, {many}"
         for name in ("bare loop", "features"):
-            peer = timings[f"{name}, {threads} threads"]
+            peer = timings[f"{name}, {many}"]
             report.rows.append(_row(f"collection, {label}", mine, name, ratio(mine, peer)))
             report.rows.append(_row(f"collection, {name}, {label}", peer))
-    timing, loop = (timings[f"{name}, {options.threads} threads"] for name in ("ours", "bare loop"))
+    many = counted(options.threads, "thread")
+    timing, loop = (timings[f"{name}, {many}"] for name in ("ours", "bare loop"))
     what = f"collection beside the bare loop, {size} environments"
     report.requirements.append(Requirement(what, ratio(timing, loop), 0.85, "of its speed"))
 

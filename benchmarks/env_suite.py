@@ -12,7 +12,7 @@ from torchrl.envs import EnvBase
 
 from benchmarks.peers.bare_env import BareEnv, random_frames
 from benchmarks.peers.gym_vector import async_vector, parallel_env
-from benchmarks.report import Options, Report, Requirement, Row
+from benchmarks.report import Options, Report, Requirement, Row, counted
 from benchmarks.timing import Timing, Work, interleaved, ratio
 from vusfa.envs import resolve_goals
 from vusfa.scenes import SceneSet
@@ -43,14 +43,14 @@ def run(options: Options) -> Report:
         timings = interleaved(works, options.repetitions, options.seconds)
     for size in sizes:
         ours, bare = timings[f"ours {size}"], timings[f"bare {size}"]
-        report.rows.append(_row(f"TargetNavEnv, {size} environments", ours, "a bare loop", bare))
-        report.rows.append(_row(f"bare loop, {size} environments", bare))
+        report.rows.append(_row(f"TargetNavEnv, {counted(size, 'environment')}", ours, "a bare loop", bare))
+        report.rows.append(_row(f"bare loop, {counted(size, 'environment')}", bare))
     large = sizes[-2]
     for name in ("ParallelEnv", "AsyncVectorEnv"):
         label = f"{name}, {workers} workers of one Gymnasium environment"
         report.rows.append(_row(label, timings[name]))
         for size in (sizes[1], large):
-            what = f"TargetNavEnv, {size} environments, beside {name}"
+            what = f"TargetNavEnv, {counted(size, 'environment')}"
             report.rows.append(_row(what, timings[f"ours {size}"], name, timings[name]))
     if not options.quick:
         report.requirements.append(

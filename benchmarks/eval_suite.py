@@ -6,7 +6,7 @@ import time
 
 import torch
 
-from benchmarks.report import Options, Report, Requirement, Row
+from benchmarks.report import Options, Report, Requirement, Row, counted
 from benchmarks.trainer import recipe_settings
 from vusfa.envs import resolve_goals
 from vusfa.evaluation import evaluate
@@ -27,7 +27,9 @@ def run(options: Options) -> Report:
     scenes = SceneSet.bundled(["bathroom"] if options.quick else None)
     torch.set_num_threads(options.threads)
     recipe = recipe_settings(options.overrides).agent
-    sizes = {f"{recipe.history} frames of {recipe.hidden_size}": (recipe.history, recipe.hidden_size)}
+    sizes = {
+        f"{counted(recipe.history, 'frame')} of {recipe.hidden_size}": (recipe.history, recipe.hidden_size)
+    }
     report = Report("eval")
     for name, (history, size) in {**sizes, "4 frames of 512": (4, 512)}.items():
         _measure(name, scenes, history, 16 if options.quick else size, options, report)

@@ -112,6 +112,15 @@ def number(value: float) -> str:
     return f"{value:.3g}"
 
 
+def counted(number: int, noun: str) -> str:
+    """A number with its noun.
+
+    >>> counted(1, "thread"), counted(2, "thread")
+    ('1 thread', '2 threads')
+    """
+    return f"{number} {noun}{'s' * (number != 1)}"
+
+
 def write_reports(path: Path, machine: dict[str, Any], options: Options, reports: Sequence[Report]) -> Path:
     """Write everything to a JSON file, atomically; NaN becomes null."""
     content = {

@@ -10,19 +10,22 @@ from rich.text import Text
 
 from benchmarks.report import Report, number
 
-__all__ = ["print_machine", "print_report"]
+__all__ = ["describe", "print_machine", "print_report"]
+
+
+def describe(machine: dict[str, Any]) -> str:
+    """One line about a machine of :func:`benchmarks.machine.describe_machine`."""
+    flags = f" ({', '.join(machine['cpu_flags'])})" if machine["cpu_flags"] else ""
+    gpu = f", {machine['gpu']}" if machine["gpu"] else ", no GPU"
+    return (
+        f"{machine['cpu']}{flags}, {machine['cores']} cores, {machine['memory_gib']} GiB{gpu};"
+        f" torch {machine['torch']}, torchrl {machine['torchrl']}, commit {machine['commit']}"
+    )
 
 
 def print_machine(machine: dict[str, Any], console: Console) -> None:
     """Print one line that describes the machine."""
-    flags = f" ({', '.join(machine['cpu_flags'])})" if machine["cpu_flags"] else ""
-    gpu = f", {machine['gpu']}" if machine["gpu"] else ", no GPU"
-    console.print(
-        Text(
-            f"{machine['cpu']}{flags}, {machine['cores']} cores, {machine['memory_gib']} GiB{gpu};"
-            f" torch {machine['torch']}, torchrl {machine['torchrl']}, commit {machine['commit']}"
-        )
-    )
+    console.print(Text(describe(machine)))
 
 
 def print_report(report: Report, console: Console, quick: bool = False) -> None:

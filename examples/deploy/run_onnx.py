@@ -14,27 +14,27 @@ from PIL import Image
 model, goal_file, folder = sys.argv[1:]
 session = onnxruntime.InferenceSession(model)
 meta = session.get_modelmeta().custom_metadata_map
-actions, size, before = json.loads(meta["actions"]), int(meta["size"]), int(meta["history"]) - 1
-resample = Image.Resampling[meta["interpolation"].upper()]
+actions, (height, width) = json.loads(meta["actions"]), json.loads(meta["size"])
+resample, kinds = Image.Resampling[meta["interpolation"].upper()], {"tensor(bool)": bool}
 if meta["crops"] != "whole":
-    sys.exit("this example squashes pictures to the network's square; this agent's are cut")
+    sys.exit("this example squashes pictures to the network's size; this agent's are cut")
 
 
-def look(path, goal, room, history):
-    """Features, probabilities of the actions, similarity with the goal, similarity with each room."""
-    picture = np.asarray(Image.open(path).convert("RGB").resize((size, size), resample))[None]
-    given = {"picture": picture, "goal": goal, "room": np.array([room])}
-    return session.run(None, {**given, "history": np.stack(history, 1)} if before else given)
+def look(path, goal, room, memory):
+    """The network's answers about a picture, by name."""
+    picture = np.asarray(Image.open(path).convert("RGB").resize((width, height), resample))[None]
+    answers = session.run(None, {"picture": picture, "goal": goal, "room": np.array([room]), **memory})
+    return {one.name: answer for one, answer in zip(session.get_outputs(), answers, strict=True)}
 
 
-nothing = np.zeros((1, session.get_outputs()[0].shape[1]), np.float32)
-goal, _, _, rooms = look(goal_file, nothing, 0, [nothing] * before)
-room, history = int(rooms.argmax()), []
-if rooms.max() < float(meta["known"]):
+given = [one for one in session.get_inputs() if one.name not in ("picture", "room")]
+memory = {one.name: np.zeros((1, *one.shape[1:]), kinds.get(one.type, np.float32)) for one in given}
+goal = look(goal_file, memory.pop("goal"), 0, memory)
+if goal["rooms"].max() < float(meta["known"]):
     sys.exit(f"{goal_file} was not taken in {' or '.join(json.loads(meta['scenes']))}")
 for path in sorted(Path(folder).iterdir()):
-    history = history or [look(path, goal, room, [nothing] * before)[0]] * before
-    features, probabilities, similarity, _ = look(path, goal, room, history)
-    history = [*history, features][1:]
-    action, arrived = int(probabilities.argmax()), similarity[0] >= float(meta["arrived"])
-    print(f"{path.name}  {actions[action]}  {probabilities[0, action]:.3f}{'  arrived' if arrived else ''}")
+    found = look(path, goal["features"], int(goal["rooms"].argmax()), memory)
+    memory = {name: found[f"next_{name}"] for name in memory}
+    action, arrived = int(found["probabilities"].argmax()), found["similarity"][0] >= float(meta["arrived"])
+    likely = found["probabilities"][0, action]
+    print(f"{path.name}  {actions[action]}  {likely:.3f}{'  arrived' if arrived else ''}")

@@ -41,7 +41,7 @@ def walk(world: Any, tmp_path: Path) -> Path:
 def test_run_prints_actions_until_it_arrives(vusfa: Any, world: Any, walk: Path, tmp_path: Path) -> None:
     path = world.checkpoint()
     result = vusfa("run", path, "--goal", tmp_path / "goal.jpg", "--camera", walk, "--greedy")
-    assert (result.exit_code, result.stderr) == (0, "")
+    assert (result.exit_code, result.stderr) == (0, f"next: vusfa export {path} agent.onnx\n")
     one = Navigator.load(path, sample=False)
     one.goal(tmp_path / "goal.jpg")
     expected = [f"room: attic; arrived from similarity {one.threshold:.2f} on"]
@@ -55,8 +55,11 @@ def test_run_prints_actions_until_it_arrives(vusfa: Any, world: Any, walk: Path,
 def test_run_says_that_the_pictures_ended(vusfa: Any, world: Any, walk: Path, tmp_path: Path) -> None:
     (walk / "3.png").unlink()
     arguments = ["run", world.checkpoint(), "--goal", tmp_path / "goal.jpg", "--camera", walk]
-    assert vusfa(*arguments).stdout.splitlines()[-1] == "not arrived: the pictures ended after 4"
-    assert vusfa(*arguments, "--max-steps", 2).stdout.splitlines()[-1] == "not arrived in 2"
+    ended, stopped = vusfa(*arguments), vusfa(*arguments, "--max-steps", 2)
+    assert ended.stdout.splitlines()[-1] == "not arrived: the pictures ended after 4"
+    assert stopped.stdout.splitlines()[-1] == "not arrived in 2"
+    assert ended.stderr.startswith("next: a camera whose pictures follow the actions")
+    assert stopped.stderr.startswith("next: more max_steps=")
 
 
 def test_bad_input_of_run_is_one_line(
@@ -87,7 +90,8 @@ def test_bad_input_of_run_is_one_line(
 
 def test_export_writes_a_file_and_compares_it(vusfa: Any, world: Any, tmp_path: Path) -> None:
     result = vusfa("export", world.checkpoint("gvf", history=1), tmp_path / "agent.onnx", "--scene", "attic")
-    assert (result.exit_code, result.stderr) == (0, "")
+    assert (result.exit_code, result.stderr.count("\n")) == (0, 1)
+    assert result.stderr.startswith(f"next: python run_onnx.py {tmp_path / 'agent.onnx'} goal.jpg")
     first, second = result.stdout.splitlines()
     assert first == f"{tmp_path / 'agent.onnx'}: 0.1 MB, model gvf"
     assert second.startswith("ONNX Runtime and PyTorch differ by ")

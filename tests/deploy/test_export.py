@@ -48,11 +48,33 @@ def test_rows_of_a_batch_do_not_see_each_other(exported: Any) -> None:
     rows = {name: draw.standard_normal(shape).astype(np.float32) for name, shape in shapes.items()}
     rows["picture"] = draw.integers(256, size=shapes["picture"], dtype=np.uint8)
     rows["room"] = np.array([0, 1, 1, 0, 1])
+    rows["started"] = np.array([True, True, False, False, True])
     together = session.run(None, rows)
     for row in range(5):
         alone = session.run(None, {name: value[row : row + 1] for name, value in rows.items()})
         for one, many in zip(alone, together, strict=True):
             np.testing.assert_allclose(one[0], many[row], atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("options", "kept"),
+    [
+        ({"model": "usfa", "memory": "lstm"}, {"started", "recurrent_state_h", "recurrent_state_c"}),
+        ({"model": "gvf", "encoder": "conv", "picture_size": [36, 40], "history": 2}, {"started", "history"}),
+    ],
+    ids=["memory", "convolutions"],
+)
+def test_agents_that_remember_or_learn_from_pictures_run_without_torch(
+    world: Any, tmp_path: Path, options: dict[str, Any], kept: set[str]
+) -> None:
+    backbone = None if "encoder" in options else world.backbone
+    navigator = Navigator.load(
+        world.checkpoint(**{"history": 1, **options}), scenes=world.scenes, backbone=backbone, sample=False
+    )
+    path = export_onnx(navigator, tmp_path / "agent.onnx")
+    pictures = [world.scenes.pictures(state) for state in (3, 7, 11, 10, 9)]
+    assert largest_difference(navigator, path, world.scenes.pictures(12), pictures) < 1e-5
+    assert check_example(navigator, path, tmp_path) == kept
 
 
 def test_the_metadata_say_what_a_program_needs(exported: Any) -> None:
@@ -62,12 +84,11 @@ def test_the_metadata_say_what_a_program_needs(exported: Any) -> None:
     assert json.loads(meta["actions"]) == list(navigator.actions)
     assert (json.loads(meta["scenes"]), json.loads(meta["aspect"])) == (["hall", "attic"], [64, 48])
     assert float(meta["arrived"]) == navigator.threshold
-    assert (meta["size"], meta["backbone"]) == ("8", "patches")
+    assert (meta["size"], meta["backbone"]) == ("[8, 8]", "patches")
     assert int(meta["history"]) == navigator.agent.config["history"]
 
 
-def test_the_example_without_torch_prints_the_navigators_actions(exported: Any, tmp_path: Path) -> None:
-    navigator, path = exported
+def test_the_example_imports_no_torch() -> None:
     source = EXAMPLE.read_text(encoding="utf-8")
     assert len(source.splitlines()) <= 40
     imported = {
@@ -77,29 +98,35 @@ def test_the_example_without_torch_prints_the_navigators_actions(exported: Any, 
         for name in node.names
     }
     assert not {"torch", "vusfa"} & imported
-    (tmp_path / "seen").mkdir()
+
+
+def check_example(navigator: Navigator, path: Path, folder: Path) -> set[str]:
+    """Compare the example's lines with the navigator's actions; return what the file keeps."""
+    (folder / "seen").mkdir(parents=True)
     expected = []
-    Image.fromarray(navigator.scenes.pictures(12).numpy()).save(tmp_path / "goal.png")
-    navigator.goal(tmp_path / "goal.png")
+    Image.fromarray(navigator.scenes.pictures(12).numpy()).save(folder / "goal.png")
+    navigator.goal(folder / "goal.png")
     for number, state in enumerate((3, 8, 12)):
-        picture = tmp_path / "seen" / f"{number}.png"
+        picture = folder / "seen" / f"{number}.png"
         Image.fromarray(navigator.scenes.pictures(state).numpy()).save(picture)
         found = navigator.act(picture)
         expected.append(f"{picture.name}  {found.name}  {found.confidence:.3f}" + "  arrived" * found.arrived)
-    arguments = [sys.executable, EXAMPLE, path, tmp_path / "goal.png", tmp_path / "seen"]
+    arguments = [sys.executable, EXAMPLE, path, folder / "goal.png", folder / "seen"]
     run = subprocess.run(arguments, capture_output=True, text=True, check=False)
     assert (run.returncode, run.stderr) == (0, "")
     assert run.stdout.splitlines() == expected
     assert [line.endswith("arrived") for line in expected] == [False, False, True]
+    inputs = pytest.importorskip("onnxruntime").InferenceSession(path).get_inputs()
+    return {one.name for one in inputs} - {"picture", "goal", "room"}
+
+
+def test_the_example_without_torch_prints_the_navigators_actions(exported: Any, tmp_path: Path) -> None:
+    assert check_example(*exported, tmp_path) == {"started", "history"}
 
 
 def test_what_cannot_be_exported_is_said_before_any_work(world: Any, tmp_path: Path) -> None:
     out = tmp_path / "agent.onnx"
     options: dict[str, Any] = {"scenes": world.scenes, "backbone": world.backbone}
-    with pytest.raises(ConfigError, match="agent with a memory"):
-        export_onnx(Navigator.load(world.checkpoint(memory="lstm"), **options), out)
-    with pytest.raises(ConfigError, match="convolutions of its own"):
-        export_onnx(Navigator.load(world.checkpoint("gvf", encoder="conv", picture_size=[36, 40])), out)
     navigator = Navigator.load(world.checkpoint(), **options)
     with pytest.raises(ConfigError, match=re.escape(f"{tmp_path}: is a folder")):
         export_onnx(navigator, tmp_path)

@@ -108,6 +108,7 @@ def run(
         )
         if found.arrived:
             typer.echo(f"arrived, with picture {number}")
+            typer.echo(f"next: vusfa export {agent} agent.onnx", err=True)
             return
         if number == max_steps:
             break
@@ -116,6 +117,12 @@ def run(
         f"not arrived: the pictures ended after {number}"
         if number < max_steps
         else f"not arrived in {number}"
+    )
+    typer.echo(
+        "next: a camera whose pictures follow the actions, or a lower threshold="
+        if number < max_steps
+        else "next: more max_steps=, or a lower threshold=",
+        err=True,
     )
 
 
@@ -154,3 +161,4 @@ def export(
         typer.echo(
             f"ONNX Runtime and PyTorch differ by {apart:.1e} at most over {len(walk)} pictures of {room.name}"
         )
+    typer.echo(f"next: python run_onnx.py {target} goal.jpg FOLDER (examples/deploy, without torch)", err=True)

@@ -66,5 +66,9 @@ def film(
         f"{out}: {name}, from state {ids[0]} to {ids[1]}, {ended} in {len(trail) - 1} actions (shortest path"
         f" {shortest})"
     )
-    if trail[-1] != last:
-        typer.echo("next: more attempts=, or another goal=; the trained goals are the easiest", err=True)
+    typer.echo(
+        f"next: open {out}; another room with scene=, another goal with goal="
+        if trail[-1] == last
+        else "next: more attempts=, or another goal=; the trained goals are the easiest",
+        err=True,
+    )

@@ -2,27 +2,34 @@
 
 | input | type | shape | content |
 |---|---|---|---|
-| ``picture`` | uint8 | (B, S, S, 3) | the camera's picture, resized to the backbone's square |
+| ``picture`` | uint8 | (B, h, w, 3) | the camera's picture, resized to h x w |
 | ``goal`` | float32 | (B, F) | ``features`` of the goal's picture, from a first call |
 | ``room`` | int64 | (B,) | index of the room, in the order of the metadata's ``scenes`` |
-| ``history`` | float32 | (B, H - 1, F) | ``features`` of the pictures before, oldest first; none for H = 1 |
+| ``started`` | bool | (B,) | whether the agent has seen a picture of this walk |
+| ``history`` | float32 | (B, H - 1, F) | ``features`` of the pictures before, oldest first |
+| ``recurrent_state_h``, ``recurrent_state_c`` | float32 | (B, L, N) | state of the LSTM |
 
 | output | type | shape | content |
 |---|---|---|---|
-| ``features`` | float32 | (B, F) | features of the picture, to pass as goal and history |
+| ``features`` | float32 | (B, F) | features of the picture, to pass as ``goal`` |
 | ``probabilities`` | float32 | (B, A) | probabilities of the actions |
 | ``similarity`` | float32 | (B,) | similarity of the picture with the goal's |
 | ``rooms`` | float32 | (B, n) | similarity of the picture with the most similar state of each room |
+| ``next_NAME`` | as ``NAME`` | as ``NAME`` | of ``started`` and the inputs below it, for the next picture |
 
-B, the batch, is any number. The metadata are strings: ``actions``, ``scenes`` (JSON lists), ``history``,
-``size``, ``resize``, ``crops``, ``interpolation``, ``aspect`` (JSON: width and height of the rooms' pictures,
-or null), ``arrived``, ``known`` (:mod:`vusfa.deploy.places`), ``backbone``, ``backbone_sha256``, ``model``,
-``normalization`` and ``vusfa`` (the version). ``examples/deploy/run_onnx.py`` runs such a file.
+B, the batch, is any number. What an agent keeps from picture to picture goes in and comes out: zeros with the
+goal's picture and with the first of a walk, then each ``next_NAME`` as ``NAME``. Agents of H > 1 frames have
+``history``, agents with an LSTM its state, both have ``started``; others have none of these.
+
+The metadata are strings: ``actions``, ``scenes`` (JSON lists), ``history`` (H), ``size`` (JSON: h and w),
+``resize``, ``crops``, ``interpolation``, ``aspect`` (JSON: width and height of the rooms' pictures, or null),
+``arrived``, ``known`` (:mod:`vusfa.deploy.places`), ``backbone`` and
+``backbone_sha256`` (empty for an agent that has convolutions of its own), ``model``, ``normalization`` and
+``vusfa`` (the version). ``examples/deploy/run_onnx.py`` runs such a file.
 """
 
 from __future__ import annotations
 
-import copy
 import json
 import logging
 import os
@@ -37,71 +44,24 @@ import torch
 from torch import Tensor, nn
 
 from vusfa import __version__
+from vusfa.deploy.graph import Graph
 from vusfa.deploy.navigator import Navigator
-from vusfa.deploy.pictures import as_picture
 from vusfa.errors import ConfigError
 from vusfa.files import check_folder, replacing
-from vusfa.modules import InferencePolicy, SceneLinear
-from vusfa.sources.crops import cut
+from vusfa.sources.crops import Preprocessing
 
 __all__ = ["export_onnx", "largest_difference"]
-
-
-class _PickedLinear(nn.Module):
-    """A SceneLinear whose weights are looked up row by row, without a size that depends on the data."""
-
-    def __init__(self, layer: SceneLinear) -> None:
-        super().__init__()
-        self.weight, self.bias = layer.weight, layer.bias
-
-    def forward(self, x: Tensor, scene_id: Tensor) -> Tensor:
-        return torch.bmm(self.weight[scene_id], x.unsqueeze(-1)).squeeze(-1) + self.bias[scene_id]
-
-
-class _Graph(nn.Module):
-    """The exported computation."""
-
-    mean: Tensor
-    std: Tensor
-
-    def __init__(self, navigator: Navigator) -> None:
-        super().__init__()
-        assert navigator.backbone is not None
-        assert isinstance(navigator.backbone.network, nn.Module)
-        self.network = copy.deepcopy(navigator.backbone.network).to(memory_format=torch.contiguous_format)  # type: ignore[call-overload]
-        preprocessing = navigator.backbone.preprocessing
-        self.register_buffer("mean", torch.tensor(preprocessing.mean))
-        self.register_buffer("std", torch.tensor(preprocessing.std))
-        self.places = navigator.places
-        agent = copy.deepcopy(navigator.agent)
-        for parent in list(agent.modules()):
-            for name, child in list(parent.named_children()):
-                if isinstance(child, SceneLinear) and child.num_scenes > 1:
-                    setattr(parent, name, _PickedLinear(child))
-        self.policy = InferencePolicy(agent)
-
-    def forward(
-        self, picture: Tensor, goal: Tensor, room: Tensor, history: Tensor | None = None
-    ) -> tuple[Tensor, ...]:
-        images = (picture.to(torch.float32) / 255 - self.mean) / self.std
-        features = self.network(images.permute(0, 3, 1, 2))
-        features = features.mean((2, 3)) if features.ndim == 4 else features
-        frames = features.unsqueeze(1)
-        frames = frames if history is None else torch.cat([history, frames], 1)
-        probabilities = self.policy.logits(frames, goal, room).softmax(-1)
-        return features, probabilities, self.places.similarity(features, goal), self.places.by_room(features)
 
 
 def export_onnx(navigator: Navigator, path: str | os.PathLike[str]) -> Path:
     """Write a navigator as an ONNX file, atomically.
 
     Args:
-        navigator: its agent reads features and has no memory; its backbone is a torch module.
+        navigator: its backbone, if it has one, is a torch module.
         path: the file to write, replaced if it exists.
 
     Raises:
-        ConfigError: the agent or backbone cannot be exported, packages are missing, or the folder cannot be
-            written.
+        ConfigError: the backbone cannot be exported, packages are missing, or the folder cannot be written.
 
     >>> from vusfa.deploy import Navigator
     >>> export_onnx(Navigator.load("run/checkpoint.pt"), "agent.onnx")  # doctest: +SKIP
@@ -111,31 +71,29 @@ def export_onnx(navigator: Navigator, path: str | os.PathLike[str]) -> Path:
     check_folder(path.parent, "the ONNX file's folder")
     if path.is_dir():
         raise ConfigError(f"{path}: is a folder; give the name of a file, such as agent.onnx")
-    _refuse_unsupported(navigator)
+    _refuse_finished_networks(navigator)
     for package in ("onnx", "onnxscript"):
         _package(package)
     onnx = import_module("onnx")
-    kept = navigator.agent.config["history"]
-    size, width = navigator.backbone.preprocessing.size, navigator.scenes.feature_size  # type: ignore[union-attr]
-    inputs: list[Tensor] = [
-        torch.zeros(2, size, size, 3, dtype=torch.uint8),
-        torch.zeros(2, width),
-        torch.zeros(2, dtype=torch.int64),
-    ]
-    names = ["picture", "goal", "room"]
-    if kept > 1:
-        inputs.append(torch.zeros(2, kept - 1, width))
-        names.append("history")
+    height, width = _size(navigator)
+    graph, kept = Graph(navigator, height, width).eval(), _kept(navigator, 2)
+    inputs = {
+        "picture": torch.zeros(2, height, width, 3, dtype=torch.uint8),
+        "goal": torch.zeros(2, _features(navigator)),
+        "room": torch.zeros(2, dtype=torch.int64),
+        **kept,
+    }
+    outputs = ["features", "probabilities", "similarity", "rooms", *(f"next_{name}" for name in kept)]
     batch = torch.export.Dim("batch")
     logging.getLogger("torch.onnx").setLevel(logging.ERROR)  # it reports missing packages
     with warnings.catch_warnings(), torch.no_grad():
         warnings.simplefilter("ignore")  # those of torch's exporter
         program: Any = torch.onnx.export(
-            _Graph(navigator).eval(),
-            tuple(inputs),
-            input_names=names,
-            output_names=["features", "probabilities", "similarity", "rooms"],
-            dynamic_shapes=({0: batch},) * len(inputs),
+            graph,
+            kwargs=inputs,
+            input_names=list(inputs),
+            output_names=outputs,
+            dynamic_shapes={name: {0: batch} for name in inputs},
             dynamo=True,
             verbose=False,
         )
@@ -146,19 +104,35 @@ def export_onnx(navigator: Navigator, path: str | os.PathLike[str]) -> Path:
     return path
 
 
-def _refuse_unsupported(navigator: Navigator) -> None:
-    agent = navigator.agent
+def _size(navigator: Navigator) -> tuple[int, int]:
+    """Height and width of the pictures that the graph reads."""
+    if navigator.backbone is not None:
+        return (navigator.backbone.preprocessing.size,) * 2
+    height, width, _ = navigator.scenes.scenes[0].picture_shape  # type: ignore[misc]
+    return height, width
+
+
+def _features(navigator: Navigator) -> int:
+    """F, features of a picture."""
+    return navigator.agent.encoder.frames.size
+
+
+def _kept(navigator: Navigator, batch: int) -> dict[str, Tensor]:
+    """Inputs that a program keeps from picture to picture, as they are at the start."""
+    agent, kept = navigator.agent, {}
+    if agent.config["history"] > 1:
+        kept["history"] = torch.zeros(batch, agent.config["history"] - 1, _features(navigator))
     if agent.memory is not None:
-        raise ConfigError(
-            "an agent with a memory (agent.memory) cannot be exported; use Navigator or vusfa run"
-        )
+        shape = batch, agent.memory.num_layers, agent.memory.hidden_size
+        kept |= {f"recurrent_state_{name}": torch.zeros(shape) for name in "hc"}  # as TorchRL names it
+    return {"started": torch.zeros(batch, dtype=torch.bool), **kept} if kept else {}
+
+
+def _refuse_finished_networks(navigator: Navigator) -> None:
     if navigator.backbone is None:
-        raise ConfigError(
-            "an agent with convolutions of its own cannot be exported; use Navigator or vusfa run"
-        )
-    if not isinstance(navigator.backbone.network, nn.Module) or isinstance(
-        navigator.backbone.network, torch.jit.ScriptModule
-    ):
+        return
+    network = navigator.backbone.network
+    if not isinstance(network, nn.Module) or isinstance(network, torch.jit.ScriptModule):
         raise ConfigError(
             f"backbone {navigator.backbone.name} is a file of a finished network, which cannot be exported;"
             " load it by name (torchvision:MODEL, timm:MODEL)"
@@ -174,22 +148,25 @@ def _package(name: str) -> Any:
 
 def _metadata(navigator: Navigator) -> dict[str, str]:
     backbone, config = navigator.backbone, navigator.agent.config
-    assert backbone is not None
-    prepared, shape = backbone.preprocessing, navigator.scenes.scenes[0].picture_shape
+    shape = navigator.scenes.scenes[0].picture_shape
+    height, width = _size(navigator)
+    # an agent with convolutions of its own reads whole pictures, and averages them down itself
+    prepared = backbone.preprocessing if backbone else Preprocessing(size=height, interpolation="bicubic")
+    pictures = "x".join(map(str, config["picture_size"]))
     return {
         "actions": json.dumps(navigator.actions),
         "scenes": json.dumps(navigator.scenes.names),
         "history": str(config["history"]),
-        "size": str(prepared.size),
+        "size": json.dumps([height, width]),
         "resize": str(prepared.resize),
         "crops": prepared.crops,
         "interpolation": prepared.interpolation,
         "aspect": json.dumps([shape[1], shape[0]] if shape else None),
         "arrived": repr(navigator.threshold),
         "known": repr(navigator.places.known),
-        "normalization": prepared.describe(),
-        "backbone": backbone.name,
-        "backbone_sha256": backbone.weights_sha256,
+        "normalization": prepared.describe() if backbone else f"averaged to {pictures}, x/127.5 - 1",
+        "backbone": backbone.name if backbone else "",
+        "backbone_sha256": backbone.weights_sha256 if backbone else "",
         "model": config["model"],
         "vusfa": __version__,
     }
@@ -210,33 +187,25 @@ def largest_difference(
     """
     runtime = _package("onnxruntime")
     session = runtime.InferenceSession(os.fspath(path), providers=["CPUExecutionProvider"])
-    assert navigator.backbone is not None
-    preprocessing, width = navigator.backbone.preprocessing, navigator.scenes.feature_size
+    names = [one.name for one in session.get_outputs()]
     navigator.goal(goal)
     assert navigator.scene is not None
-    kept, room = navigator.agent.config["history"], navigator.scenes.scene_index(navigator.scene)
-    history: list[np.ndarray] = []
+    room = np.array([navigator.scenes.scene_index(navigator.scene)])
+    kept = {name: value.numpy() for name, value in _kept(navigator, 1).items()}
 
-    def ask(picture: Any, goal: np.ndarray) -> list[np.ndarray]:
-        given = {
-            "picture": cut(as_picture(picture)[0], preprocessing),
-            "goal": goal,
-            "room": np.array([room]),
-            "history": np.stack(history, 1) if history else np.zeros((1, kept - 1, width), np.float32),
-        }
-        return session.run(None, {one.name: given[one.name] for one in session.get_inputs()})
+    def ask(picture: Any, goal: np.ndarray) -> dict[str, np.ndarray]:
+        seen = navigator.resized(picture)[None]
+        found = session.run(None, {"picture": seen, "goal": goal, "room": room, **kept})
+        return dict(zip(names, found, strict=True))
 
-    target, most = ask(goal, np.zeros((1, width), np.float32))[0], 0.0
+    target = ask(goal, np.zeros((1, _features(navigator)), np.float32))["features"]
+    most = 0.0
     for picture in pictures:
-        if not history and kept > 1:  # the first picture fills the history
-            history = [ask(picture, target)[0]] * (kept - 1)
-        features, probabilities, similarity, _ = ask(picture, target)
-        history = [*history, features][1:] if kept > 1 else []
-        found = navigator.act(picture)
+        found = ask(picture, target)
+        kept = {name: found[f"next_{name}"] for name in kept}
+        navigator.act(picture)
+        assert navigator.probabilities is not None
         assert navigator.similarity is not None
-        most = max(
-            most,
-            abs(float(probabilities[0, found.index]) - found.confidence),
-            abs(float(similarity[0]) - navigator.similarity),
-        )
+        apart = np.abs(found["probabilities"][0] - navigator.probabilities.numpy()).max()
+        most = max(most, float(apart), abs(float(found["similarity"][0]) - navigator.similarity))
     return most

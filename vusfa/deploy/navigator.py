@@ -21,7 +21,7 @@ from vusfa.limits import listing
 from vusfa.modules import Agent
 from vusfa.scenes import SceneSet
 from vusfa.sources.backbones import Backbone
-from vusfa.sources.crops import prepare
+from vusfa.sources.crops import cut, prepare
 from vusfa.training.checkpoint import rebuild_agent
 
 __all__ = ["Action", "Navigator", "reading_pictures"]
@@ -60,6 +60,7 @@ class Navigator:
 
     Attributes:
         scene: name of the room; None before the first goal.
+        probabilities: (A,) float32, of the actions at the last picture; None before the first.
         similarity: similarity of the last picture with the goal's; None before the first.
         threshold: see Args.
 
@@ -99,6 +100,7 @@ class Navigator:
             raise ConfigError(f"threshold is {threshold}; a similarity is between -1 and 1, such as 0.8")
         self.threshold = self.places.arrived if threshold is None else threshold
         self.scene = None if scene is None else self.scenes.names[self.scenes.scene_index(scene)]
+        self.probabilities: Tensor | None = None
         self.similarity: float | None = None
         self._named = scene is not None
         self._sample, self._crop = sample, crop
@@ -140,7 +142,7 @@ class Navigator:
         """Begin a new walk towards the same goal: forget the pictures seen."""
         self._history: list[Tensor] = []
         self._memory: dict[Any, Tensor] = {}
-        self.similarity = None
+        self.probabilities, self.similarity = None, None
 
     def goal(self, picture: Any) -> str:
         """Set the goal by a picture taken there, and begin a new walk.
@@ -204,7 +206,7 @@ class Navigator:
         rows = self._policy(rows)
         keys = [key for key in self._policy.out_keys if isinstance(key, tuple) and key[0] == "next"]
         self._memory = {key[1:]: rows.get(key) for key in keys}
-        probabilities = rows["logits"].softmax(-1)[0]
+        self.probabilities = probabilities = rows["logits"].softmax(-1)[0]
         if self._sample:
             index = int(torch.multinomial(probabilities, 1, generator=self._generator))
         else:
@@ -212,6 +214,20 @@ class Navigator:
         self.similarity = self.places.similarity(features, self._goal[1]).item()
         arrived = self.similarity >= self.threshold
         return Action(self.actions[index], index, probabilities[index].item(), arrived)
+
+    def resized(self, picture: Any) -> np.ndarray:
+        """A picture as the network reads it before normalization, (h, w, 3) uint8.
+
+        Args:
+            picture: as for :meth:`act`, with its errors.
+        """
+        return self._resized(self._picture(picture)[0])
+
+    def _resized(self, picture: np.ndarray) -> np.ndarray:
+        if self.backbone is not None:
+            return cut(picture, self.backbone.preprocessing)[0]
+        height, width, _ = self.scenes.scenes[0].picture_shape  # type: ignore[misc]
+        return np.asarray(Image.fromarray(picture).resize((width, height), Image.Resampling.BICUBIC))
 
     def _picture(self, picture: Any) -> tuple[np.ndarray, str]:
         array, name = as_picture(picture)
@@ -232,9 +248,7 @@ class Navigator:
                     f" {self.scenes.feature_size}; pass the backbone that made them"
                 )
             return features, features
-        height, width, _ = self.scenes.scenes[0].picture_shape  # type: ignore[misc]
-        small = Image.fromarray(picture).resize((width, height), Image.Resampling.BICUBIC)
-        pixels = torch.from_numpy(np.array(small)).permute(2, 0, 1)
+        pixels = torch.from_numpy(np.array(self._resized(picture))).permute(2, 0, 1)
         return pixels, self.agent.encoder.frames.encode(pixels[None])[0]
 
 
