@@ -13,11 +13,14 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 from PIL import Image
 
 from vusfa.deploy import Navigator
 from vusfa.deploy.export import export_onnx, largest_difference
+from vusfa.deploy.graph import _windows
 from vusfa.errors import ConfigError
+from vusfa.modules.frames import shrink_pictures
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "deploy" / "run_onnx.py"
 
@@ -56,25 +59,27 @@ def test_rows_of_a_batch_do_not_see_each_other(exported: Any) -> None:
             np.testing.assert_allclose(one[0], many[row], atol=1e-5)
 
 
-@pytest.mark.parametrize(
-    ("options", "kept"),
-    [
-        ({"model": "usfa", "memory": "lstm"}, {"started", "recurrent_state_h", "recurrent_state_c"}),
-        ({"model": "gvf", "encoder": "conv", "picture_size": [36, 40], "history": 2}, {"started", "history"}),
-    ],
-    ids=["memory", "convolutions"],
-)
-def test_agents_that_remember_or_learn_from_pictures_run_without_torch(
-    world: Any, tmp_path: Path, options: dict[str, Any], kept: set[str]
+def test_an_agent_that_remembers_and_learns_from_pictures_runs_without_torch(
+    world: Any, tmp_path: Path
 ) -> None:
-    backbone = None if "encoder" in options else world.backbone
-    navigator = Navigator.load(
-        world.checkpoint(**{"history": 1, **options}), scenes=world.scenes, backbone=backbone, sample=False
-    )
+    path = world.checkpoint("usfa", memory="lstm", encoder="conv", picture_size=[36, 40], history=2)
+    navigator = Navigator.load(path, scenes=world.scenes, sample=False)
     path = export_onnx(navigator, tmp_path / "agent.onnx")
     pictures = [world.scenes.pictures(state) for state in (3, 7, 11, 10, 9)]
     assert largest_difference(navigator, path, world.scenes.pictures(12), pictures) < 1e-5
+    kept = {"started", "history", "recurrent_state_h", "recurrent_state_c"}
     assert check_example(navigator, path, tmp_path) == kept
+
+
+@pytest.mark.parametrize(("size", "number"), [(48, 36), (64, 40), (150, 60), (40, 40), (36, 50)])
+def test_pictures_are_averaged_to_the_last_bit_as_the_agent_averages_them(size: int, number: int) -> None:
+    pixels = torch.randint(256, (1, 3, size, size), generator=torch.Generator().manual_seed(0)).to(
+        torch.uint8
+    )
+    windows = _windows(size, number)
+    sums = windows @ pixels.float() @ windows.T
+    found = (sums / windows.sum(1)[:, None] / windows.sum(1)).round().to(torch.uint8)
+    assert torch.equal(found, shrink_pictures(pixels, (number, number)))
 
 
 def test_the_metadata_say_what_a_program_needs(exported: Any) -> None:

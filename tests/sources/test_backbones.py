@@ -16,6 +16,7 @@ from vusfa.errors import ConfigError
 from vusfa.sources.backbones import LITE0_SHA256, Backbone, load_backbone
 from vusfa.sources.crops import Preprocessing, prepare
 from vusfa.sources.encode import encode_pictures
+from vusfa.sources.layers import Patches
 from vusfa.sources.row_log import file_sha256
 
 
@@ -161,6 +162,43 @@ def test_timms_pooled_features_with_its_own_preprocessing(
     np.testing.assert_allclose(encode_pictures(pictures, patches), found, atol=1e-6)  # without the prefix
     with pytest.raises(ConfigError, match="timm has no model 'big'"):
         load_backbone("timm:big", weights=path)
+
+
+@pytest.mark.parametrize(
+    ("given", "attributes", "expected"),
+    [
+        ((2, 7, 4), {"num_prefix_tokens": 3}, 4),  # a vision transformer
+        ((2, 7, 4), {"cls_token": None}, 6),  # CaiT, XCiT
+        ((2, 7, 4), {}, 7),  # LeViT, MLP-Mixer
+        ((2, 3, 3, 4), {"output_fmt": "NHWC"}, 9),  # Swin
+        ((2, 4, 3, 3), {}, 9),  # a network of convolutions
+    ],
+    ids=str,
+)
+def test_patches_of_timms_families(given: tuple[int, ...], attributes: dict[str, Any], expected: int) -> None:
+    network = nn.Identity()
+    network.forward_features = lambda images: images  # type: ignore[assignment]
+    for name, value in attributes.items():
+        setattr(network, name, value)
+    found = Patches(network)(torch.zeros(given))
+    assert (found.shape[:2], found[0, 0].numel()) == ((2, 4), expected)
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_timm_itself(tmp_path: Path, pictures: np.ndarray) -> None:
+    library = pytest.importorskip("timm")
+    for name in ("resnet10t", "vit_tiny_patch16_224", "swin_tiny_patch4_window7_224", "mixer_s32_224"):
+        network = library.create_model(name, pretrained=False).eval()
+        torch.save(network.state_dict(), tmp_path / "weights.pth")
+        for layer in (None, "patches"):
+            backbone = load_backbone(f"timm:{name}", weights=tmp_path / "weights.pth", layer=layer)
+            found = encode_pictures(pictures[:1], backbone)
+            with torch.no_grad():
+                features = network.forward_features(prepare(pictures[:1], backbone.preprocessing))
+                expected = network.forward_head(features, pre_logits=True)[0]
+            assert found.shape == (1, 1, network.num_features)
+            if layer is None:
+                np.testing.assert_allclose(found[0, 0], expected, atol=1e-4)
 
 
 @pytest.mark.filterwarnings("ignore:.*torch.jit:DeprecationWarning")

@@ -161,4 +161,6 @@ def export(
         typer.echo(
             f"ONNX Runtime and PyTorch differ by {apart:.1e} at most over {len(walk)} pictures of {room.name}"
         )
-    typer.echo(f"next: python run_onnx.py {target} goal.jpg FOLDER (examples/deploy, without torch)", err=True)
+    typer.echo(
+        f"next: python run_onnx.py {target} goal.jpg FOLDER (examples/deploy, without torch)", err=True
+    )

@@ -87,10 +87,12 @@ class Graph(nn.Module):
     def __init__(self, navigator: Navigator, height: int, width: int) -> None:
         super().__init__()
         agent = copy.deepcopy(navigator.agent)
-        if navigator.backbone is None:
-            self.look: nn.Module = _Convolved(agent.encoder.frames, height, width)
-            agent.encoder.frames = FeatureFrames(torch.zeros(1, 1, agent.encoder.frames.size), lookup=False)
+        frames = agent.encoder.frames
+        if isinstance(frames, PictureFrames):
+            self.look: nn.Module = _Convolved(frames, height, width)
+            agent.encoder.frames = FeatureFrames(torch.zeros(1, 1, frames.size), lookup=False)
         else:
+            assert navigator.backbone is not None
             self.look = _Pooled(navigator.backbone)
         self.places = navigator.places
         for parent in list(agent.modules()):

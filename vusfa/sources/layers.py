@@ -55,7 +55,11 @@ class Patches(nn.Module):
 
     def forward(self, images: Tensor) -> Tensor:
         """Tokens as a map (n, F, T, 1), or the map that the network gives."""
-        found = self.network.forward_features(images)  # type: ignore[operator]
+        network: Any = self.network
+        found = network.forward_features(images)
         if found.ndim == 3:  # tokens, the class and the registers first
-            found = found[:, self.network.num_prefix_tokens :].transpose(1, 2).unsqueeze(3)
+            first = getattr(network, "num_prefix_tokens", int(hasattr(network, "cls_token")))
+            return found[:, first:].transpose(1, 2).unsqueeze(3)
+        if getattr(network, "output_fmt", "NCHW") == "NHWC":  # as Swin gives its map
+            return found.permute(0, 3, 1, 2)
         return found
