@@ -202,6 +202,15 @@ def test_the_table_fits_a_terminal(episodes: Episodes):
     assert "a note" in text
 
 
+@pytest.mark.parametrize("policy", ["vusfa + replay search", "vusfa, fine-tuned for the kitchen"])
+def test_a_long_name_breaks_and_numbers_do_not(episodes: Episodes, policy: str):
+    page = io.StringIO()
+    rows = summary(episodes, policy) + summary(shortest_paths(episodes), "shortest path")
+    print_summary(rows, Console(file=page, width=72))
+    assert "…" not in page.getvalue()
+    assert page.getvalue().count("100.0") >= 9
+
+
 def test_the_table_does_not_repeat_itself(episodes: Episodes):
     page = io.StringIO()
     print_summary(summary(episodes.select(episodes.trained), "walker"), Console(file=page, width=80))

@@ -36,12 +36,14 @@ def list_agents() -> None:
     from vusfa.deploy.agents import PRETRAINED, pretrained_names
     from vusfa.deploy.cards import card_head
 
-    for name in pretrained_names():
+    names = pretrained_names()
+    width = max(map(len, names))
+    for name in names:
         facts = card_head((PRETRAINED / f"{name}.md").read_text(encoding="utf-8"))["vusfa"]
         exact = facts["exact"]["all"]
         success, spl = (100 * exact[metric][0] for metric in ("success_500", "spl"))
         typer.echo(
-            f"{name:<16}  {facts['bytes'] / 1e6:.1f} MB  {facts['frames']:>9,} frames"
+            f"{name:<{width}}  {facts['bytes'] / 1e6:.1f} MB  {facts['frames']:>9,} frames"
             f"  success {success:5.1f} %  SPL {spl:5.1f} %  (all goals, 500 actions, exact)"
         )
     typer.echo(

@@ -150,9 +150,9 @@ def print_summary(rows: Sequence[Row], console: Console | None = None, note: str
             title=f"{subset} goals", title_justify="left", box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0)
         )
         table.add_column("scene", no_wrap=True)
-        table.add_column("policy", no_wrap=True)
+        table.add_column("policy")  # breaks before a number would
         for metric in metrics:
-            table.add_column(metric.short, justify="right")
+            table.add_column(metric.short, justify="right", no_wrap=True)
         for scene in dict.fromkeys(row["scene"] for row in chosen):
             group = [row for row in chosen if row["scene"] == scene]
             for place, row in enumerate(group):

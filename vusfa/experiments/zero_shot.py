@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 from typing import Literal
 
@@ -98,3 +99,4 @@ def zero_shot(
     print_summary(result.rows, note=result.note)
     for path in result.save(stem):
         print(path)
+    print(f"next: vusfa report {checkpoint.parent}, vusfa film {checkpoint.parent}", file=sys.stderr)
