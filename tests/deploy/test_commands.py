@@ -71,6 +71,12 @@ def test_bad_input_of_run_is_one_line(
     for arguments, words in [
         ([tmp_path / "none.pt", "--goal", goal, "--camera", walk], "none.pt: no such checkpoint"),
         (
+            ["vusfe", "--goal", goal, "--camera", walk],
+            "agent of this name; did you mean 'vusfa'?",
+        ),
+        (["vusfa-hindsight", "--goal", goal, "--camera", walk], "of this name; there are gvf, sfdp, usfa,"),
+        ([tmp_path / "runs", "--goal", goal, "--camera", walk], "runs: no such checkpoint"),
+        (
             [path, "--goal", tmp_path / "other.png", "--camera", walk],
             "was not taken in the rooms hall, attic",
         ),

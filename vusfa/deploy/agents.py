@@ -122,9 +122,14 @@ def open_agent(source: str | os.PathLike[str], scenes: SceneSet | None = None) -
     >>> open_agent("gvf").agent.config["model"]
     'gvf'
     """
-    path = Path(source)
-    if not path.is_file() and str(source) in pretrained_names():
+    path, names = Path(source), pretrained_names()
+    if not path.is_file() and str(source) in names:
         return load_pretrained(str(source), scenes)
+    if not path.exists() and not path.suffix and path.name == str(source):
+        raise CheckpointError(
+            f"{source}: there is no such file or folder, and no pretrained agent of this name;"
+            f" {near(str(source), names)}"
+        )
     if path.suffix == ".safetensors":
         return read_agent(path, scenes)
     agent, scenes, state = load_agent(path, scenes)

@@ -48,12 +48,14 @@ def find_backbone(scenes: SceneSet, backbone: str | Backbone | None = None) -> B
         if known is None:
             raise ConfigError(
                 f"scene {first!r} does not say which backbone made its features; pass it as"
-                " backbone=load_backbone(...), or recompute them with vusfa scenes encode"
+                " backbone=load_backbone(...) (backbone=NAME of vusfa run and export), or recompute them with"
+                " vusfa scenes encode"
             )
         if known != DEFAULT:
             raise ConfigError(
                 f"the features of scene {first!r} are those of {brief(known)}, whose weights are a file of"
-                f" yours; pass backbone=load_backbone({brief(known)}, weights=...)"
+                f" yours; pass backbone=load_backbone({brief(known)}, weights=...) (backbone=NAME weights=FILE"
+                " of vusfa run and export)"
             )
         crops = facts.get("feature_crops")
         backbone = load_backbone(DEFAULT, crops=crops if crops in CROPS else None)
