@@ -54,8 +54,8 @@ def find_backbone(scenes: SceneSet, backbone: str | Backbone | None = None) -> B
         if known != DEFAULT:
             raise ConfigError(
                 f"the features of scene {first!r} are those of {brief(known)}, whose weights are a file of"
-                f" yours; pass backbone=load_backbone({brief(known)}, weights=...) (backbone=NAME weights=FILE"
-                " of vusfa run and export)"
+                f" yours; pass backbone=load_backbone({brief(known)}, weights=...) (backbone=NAME"
+                " weights=FILE of vusfa run and export)"
             )
         crops = facts.get("feature_crops")
         backbone = load_backbone(DEFAULT, crops=crops if crops in CROPS else None)
