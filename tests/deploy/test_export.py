@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import json
+import os
 import re
 import subprocess
 import sys
@@ -21,6 +22,7 @@ from vusfa.deploy.export import export_onnx, largest_difference
 from vusfa.deploy.graph import _windows
 from vusfa.errors import ConfigError
 from vusfa.modules.frames import shrink_pictures
+from vusfa.sources.backbones import load_backbone
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "deploy" / "run_onnx.py"
 
@@ -127,6 +129,15 @@ def check_example(navigator: Navigator, path: Path, folder: Path) -> set[str]:
 
 def test_the_example_without_torch_prints_the_navigators_actions(exported: Any, tmp_path: Path) -> None:
     assert check_example(*exported, tmp_path) == {"started", "history"}
+
+
+def test_onnx_runtime_is_told_to_report_nothing(exported: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    navigator, path = exported
+    monkeypatch.delenv("ORT_DISABLE_TELEMETRY", raising=False)
+    largest_difference(navigator, path, navigator.scenes.pictures(12), [])
+    assert os.environ.pop("ORT_DISABLE_TELEMETRY") == "1"
+    load_backbone(path)
+    assert os.environ["ORT_DISABLE_TELEMETRY"] == "1"
 
 
 def test_what_cannot_be_exported_is_said_before_any_work(world: Any, tmp_path: Path) -> None:

@@ -140,6 +140,7 @@ def _refuse_finished_networks(navigator: Navigator) -> None:
 
 
 def _package(name: str) -> Any:
+    os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")  # onnxruntime reports its use when it is imported
     try:
         return import_module(name)
     except ModuleNotFoundError as error:

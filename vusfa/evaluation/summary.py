@@ -149,8 +149,8 @@ def print_summary(rows: Sequence[Row], console: Console | None = None, note: str
         table = Table(
             title=f"{subset} goals", title_justify="left", box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0)
         )
-        table.add_column("scene", no_wrap=True)
-        table.add_column("policy")  # breaks before a number would
+        for name in ("scene", "policy"):  # these break before a number would
+            table.add_column(name, overflow="fold")
         for metric in metrics:
             table.add_column(metric.short, justify="right", no_wrap=True)
         for scene in dict.fromkeys(row["scene"] for row in chosen):

@@ -179,6 +179,7 @@ def _require(path: Path) -> None:
 
 
 def _package(name: str, wanted_by: str, install: str) -> Any:
+    os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")  # onnxruntime reports its use when it is imported
     try:
         return import_module(name)
     except ModuleNotFoundError as error:
