@@ -27,8 +27,9 @@ __all__ = ["Measured", "measure", "measure_files", "run"]
 ENVS = (64, 1024, 4096)
 #: Rooms in files: copies of the bundled ones; generated ones of 80 states, for which heads are shared.
 TILED, GENERATED = (4, 40, 400), (4, 4000, 10_000)
-#: Rooms in which episodes begin at a time.
-ACTIVE = 4
+#: Rooms in which episodes begin at a time, and frames for which one is active: many times the 64 x 500 frames
+#: until the last episode in a room that is left has ended.
+ACTIVE, STAY = 4, 400_000
 #: Requirements: frames per second and share of the rate with four rooms in 400 rooms; seconds to open 10,000
 #: rooms, share of the rate with four, and MiB.
 RATE_400, SHARE_400 = 20_000.0, 0.75
@@ -114,7 +115,8 @@ def _add(report: Report, label: str, found: Measured, beside: float) -> None:
 def _rotating(options: Options, shared: bool) -> list[str]:
     sizes = {"num_envs": 8, "active": 1} if options.quick else {"num_envs": ENVS[0], "active": ACTIVE}
     overrides = [*small(options), f"collector.num_envs={sizes['num_envs']}", "env.goals=random:5"]
-    return [*overrides, f"env.active_scenes={sizes['active']}", f"agent.shared_heads={str(shared).lower()}"]
+    overrides += [f"env.active_scenes={sizes['active']}", f"env.scene_stay={STAY}"]
+    return [*overrides, f"agent.shared_heads={str(shared).lower()}"]
 
 
 def _apart(call: object, *arguments: object) -> Measured:

@@ -24,6 +24,7 @@ __all__ = [
     "dataset_in",
     "opened",
     "plain",
+    "read_all",
     "read_attributes",
     "read_distances",
     "read_features",
@@ -33,7 +34,7 @@ __all__ = [
 
 _NUMBERS_AT_ONCE = 1 << 22
 #: Size up to which reading a file costs less than mapping it.
-_READ_WHOLE = 1 << 20
+_READ_WHOLE = 1 << 24
 
 
 @contextmanager
@@ -161,10 +162,20 @@ def dataset_in(file: h5py.File, name: str) -> h5py.Dataset | None:
     if made.get_external_count() or made.get_layout() == h5py.h5d.VIRTUAL:
         raise OSError("its data lie outside the file; store them in the file itself")
     found = h5py.Dataset(there)
-    fault = size_fault(found)
+    fault = size_fault(there, made)
     if fault is not None:
         raise OSError(fault)
     return found
+
+
+def read_all(dataset: h5py.Dataset) -> np.ndarray:
+    """A dataset as an array; numbers take few calls of the library."""
+    there = dataset.id
+    if there.dtype.kind not in "iuf" or not there.shape or 0 in there.shape:
+        return np.asarray(dataset[()])
+    values = np.empty(there.shape, there.dtype)
+    there.read(h5py.h5s.ALL, h5py.h5s.ALL, values)
+    return values
 
 
 def read_distances(dataset: h5py.Dataset) -> np.ndarray:
@@ -239,10 +250,10 @@ def _copy_attributes(source: h5py.Dataset, target: h5py.Dataset) -> None:
             target.attrs.create(key, source.attrs[key], dtype=kind)
 
 
-def size_fault(dataset: h5py.Dataset) -> str | None:
+def size_fault(dataset: h5py.h5d.DatasetID, made: h5py.h5p.PropDCID) -> str | None:
     """Fault of a dataset that declares more than it can hold or more than may be read; None without one."""
-    shape, itemsize, stored = dataset.shape or (), dataset.dtype.itemsize, dataset.id.get_storage_size()
-    declared = math.prod(shape) * itemsize if dataset.shape is not None else 0
+    shape, itemsize, stored = dataset.shape or (), dataset.dtype.itemsize, dataset.get_storage_size()
+    declared = math.prod(shape) * itemsize
     if shape and shape[0] > limits.MAX_STATES:
         return f"declares {shape[0]} states; at most {limits.MAX_STATES} are read"
     times = limits.MAX_PICTURE_COMPRESSION if len(shape) == 4 else limits.MAX_COMPRESSION
@@ -254,7 +265,8 @@ def size_fault(dataset: h5py.Dataset) -> str | None:
             f"needs {needed} bytes as float32, but {stored} are stored; at most {most} more are allowed:"
             " store float32, or fewer crops"
         )
-    most, chunks = limits.MAX_CHUNK_BYTES, dataset.chunks
+    most = limits.MAX_CHUNK_BYTES
+    chunks = made.get_chunk() if made.get_layout() == h5py.h5d.CHUNKED else None
     if chunks and math.prod(chunks) * itemsize > most:
         return f"has chunks of shape {chunks}; at most {most} bytes per chunk are read"
     return None

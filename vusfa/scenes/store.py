@@ -34,6 +34,7 @@ from vusfa.scenes.hdf5 import (
     copy_others,
     dataset_in,
     opened,
+    read_all,
     read_attributes,
     read_distances,
     read_features,
@@ -131,24 +132,25 @@ def read(path: str | os.PathLike[str], lazy: bool = False) -> Dump:
                 dataset = dataset_in(file, name)
                 if dataset is None:
                     continue
+                shape: tuple[int, ...] = dataset.id.shape or ()
                 if lazy and name == "resnet_feature":
-                    alike = np.broadcast_to(np.zeros((), dataset.dtype), dataset.shape)
+                    alike = np.broadcast_to(np.zeros((), dataset.id.dtype), shape)
                     fault = shape_fault(name, alike, len(dump.arrays.get("graph", alike)))
                     if fault is None:
                         dump.left.append(name)
-                        dump.stored = StoredFeatures(path.resolve(), torch.Size(dataset.shape), stamp)
+                        dump.stored = StoredFeatures(path.resolve(), torch.Size(shape), stamp)
                     else:
                         dump.reading_faults.append(fault)
                 elif name == "resnet_feature":
                     dump.arrays[name] = read_features(dataset)
                 elif name != "shortest_path_distance":
-                    dump.arrays[name] = np.asarray(dataset[()])
-                elif not lazy and dataset.shape[:1] <= (TABLE_STATES,):
+                    dump.arrays[name] = read_all(dataset)
+                elif not lazy and shape[:1] <= (TABLE_STATES,):
                     dump.arrays[name] = read_distances(dataset)
-                elif dataset.shape == np.shape(dump.arrays.get("graph", ()))[:1] * 2:
+                elif shape == np.shape(dump.arrays.get("graph", ()))[:1] * 2:
                     dump.left.append(name)
                 else:
-                    dump.arrays[name] = np.broadcast_to(np.zeros((), dataset.dtype), dataset.shape)
+                    dump.arrays[name] = np.broadcast_to(np.zeros((), dataset.dtype), shape)
             except (OSError, RuntimeError, TypeError, ValueError) as error:
                 dump.reading_faults.append(
                     f"dataset {name!r} cannot be read ({error}); copy the file or make it again"
