@@ -34,7 +34,7 @@ __all__ = [
 
 _NUMBERS_AT_ONCE = 1 << 22
 #: Size up to which reading a file costs less than mapping it.
-_READ_WHOLE = 1 << 24
+_READ_WHOLE = 1 << 21
 
 
 @contextmanager
