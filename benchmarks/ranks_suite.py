@@ -18,7 +18,6 @@ from typing import Any
 import torch
 from omegaconf import OmegaConf
 from torch import distributed
-from torch.utils.flop_counter import FlopCounterMode
 
 from benchmarks.report import Options, Report, Requirement, Row
 from benchmarks.timing import Work, interleaved
@@ -166,12 +165,10 @@ def _constants(options: Options, report: Report) -> None:
             frames[str(factor)] = factor * envs * settings.collector.rollout
         timings = interleaved(works, options.repetitions, options.seconds)
         seconds = {frames[name]: 1.0 / timing.per_second for name, timing in timings.items()}
-        with FlopCounterMode(display=False) as counter:
+        with torch.profiler.profile(with_flops=True) as profile:
             ours.update()
-        operations = counter.get_total_flops() / frames["4"]
+        operations = sum(event.flops for event in profile.key_averages()) / frames["4"]
         report.rows.append(Row("operations of an update", operations, "FLOP/frame"))
-        with torch.profiler.profile() as profile:
-            ours.update()
         calls = sum(1 for event in profile.events() if event.cpu_parent is None)
         report.rows.append(Row("torch calls of an update", calls, "calls"))
         report.rows.append(Row("steps of a rollout", settings.collector.rollout, "steps"))

@@ -85,7 +85,8 @@ def _run(
     while trainer.frames < total and not ranks.stopped and not ended:
         before = trainer.frames
         trainer.update(batches)
-        stop.received = ranks.stopped or stop.received
+        if ranks.size > 1:  # the signal may have been another rank's
+            stop.received = ranks.stopped or stop.received
         progress.update(trainer.frames)
         ended = trainer.frames >= total  # a short training is logged, too
         if converged is not None and not ended and before // every < trainer.frames // every:
