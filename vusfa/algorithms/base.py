@@ -16,7 +16,8 @@ from tensordict import TensorDictBase
 from torch import Tensor, nn
 
 from vusfa.algorithms.schedule import threads_per_step
-from vusfa.modules import Agent
+from vusfa.envs.observation import crop_index
+from vusfa.modules import Agent, FeatureFrames
 from vusfa.scenes import SceneSet
 
 __all__ = ["Algorithm", "AlgorithmSettings"]
@@ -32,9 +33,10 @@ class AlgorithmSettings:
 class Algorithm:
     """Losses of an agent, and what belongs to them.
 
-    An update is :meth:`schedule`, collect, :meth:`losses` and one optimizer step, :attr:`replay_steps` times
-    :meth:`replay_losses` and one optimizer step, :meth:`after_step`; the same for further
-    :meth:`minibatches`, without replay. Entries named ``loss_...`` are added up; others are logged.
+    An update is :meth:`show_crops`, :meth:`schedule`, collect, :meth:`losses` and one optimizer step,
+    :attr:`replay_steps` times :meth:`show_crops`, :meth:`replay_losses` and one optimizer step,
+    :meth:`after_step`; the same for further :meth:`minibatches`, without replay. Entries named ``loss_...``
+    are added up; others are logged.
 
     Args:
         agent: what learns.
@@ -64,6 +66,21 @@ class Algorithm:
     def prepare(self) -> str | None:
         """Work before the first batch of a new training, not of a resumed one; returns a line to print."""
         return None
+
+    def show_crops(self) -> None:
+        """Show an agent that reads ids other crops than the first, as ``env.crop`` says: in training mode it
+        sees every state, as state and as goal, in that crop, or in one drawn anew at each call.
+
+        Agents that are handed features get theirs from :class:`~vusfa.envs.SceneObservation`.
+        """
+        crop = crop_index(self.settings["env"]["crop"], self.scenes.num_crops)
+        frames = getattr(getattr(self.agent, "encoder", None), "frames", None)  # an extension may have none
+        if crop == 0 or not isinstance(frames, FeatureFrames) or not frames.num_states:
+            return
+        features = self.scenes.features
+        number, crops = features.shape[:2]
+        drawn = torch.randint(crops, (number,)) if crop is None else torch.full((number,), crop)
+        frames.show(features[torch.arange(number), drawn])
 
     def schedule(self, frames: int) -> None:
         """Set what depends on the number of frames trained on, such as a coefficient."""

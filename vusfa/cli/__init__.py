@@ -24,6 +24,7 @@ COMMANDS = [
     "vusfa.cli.photos",
     "vusfa.cli.thor",
     "vusfa.cli.encode",
+    "vusfa.cli.augment",
     "vusfa.cli.fetch",
     "vusfa.cli.render",
     "vusfa.cli.render_rooms",
@@ -86,6 +87,14 @@ FUNCTIONS: dict[str, Forwarded] = {
         "Train in some rooms, test in others.",
         {"": "vusfa.experiments.generalise.generalise"},
         ("vusfa generalise rooms/small", "vusfa generalise rooms/small total_frames=1000000 seed=1"),
+    ),
+    "robustness": Forwarded(
+        "Evaluate an agent in changed renderings of its rooms.",
+        {"": "vusfa.deploy.robustness.robustness"},
+        (
+            "vusfa robustness runs/first changes/dimmer changes/noise",
+            "vusfa robustness runs/robust changes/dimmer changes/noise name=augmented episodes=2",
+        ),
     ),
 }
 

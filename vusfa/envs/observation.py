@@ -17,10 +17,11 @@ from torchrl.envs import ObservationTransform, TransformedEnv
 
 from vusfa.envs.navigation import TargetNavEnv
 from vusfa.errors import ConfigError, SceneError
+from vusfa.limits import brief
 from vusfa.scenes import Scene, SceneSet
 from vusfa.scenes.features import SceneRows
 
-__all__ = ["SceneObservation", "observation_table"]
+__all__ = ["SceneObservation", "crop_index", "observation_table"]
 
 
 def observation_table(scenes: SceneSet, kind: str, size: tuple[int, int] | None = None) -> Tensor:
@@ -59,6 +60,30 @@ def _pixels(scene: Scene, size: tuple[int, int] | None) -> Tensor:
     if size is not None and tuple(pixels.shape[-2:]) != tuple(size):
         pixels = interpolate(pixels, size=tuple(size), mode="bilinear", antialias=True)
     return pixels.contiguous()
+
+
+def crop_index(crop: str | int, crops: int, kind: str = "features") -> int | None:
+    """The crop that "first" or an index names; None for "random", which draws one each time.
+
+    Args:
+        crop: "first", "random", or an index.
+        crops: C, how many there are.
+        kind: of what, for the message.
+
+    Raises:
+        ConfigError: there is no such crop.
+
+    >>> crop_index("first", 10), crop_index("random", 10), crop_index(3, 10)
+    (0, None, 3)
+    """
+    index = {"first": 0, "random": None}.get(crop, -1) if isinstance(crop, str) else crop
+    if index is not None and (
+        isinstance(index, bool) or not isinstance(index, int) or not 0 <= index < crops
+    ):
+        raise ConfigError(
+            f"crop is {brief(crop)}; give 'first', 'random', or an index below {crops} for {kind}"
+        )
+    return index
 
 
 class SceneObservation(ObservationTransform):
@@ -107,11 +132,7 @@ class SceneObservation(ObservationTransform):
         if kind not in ("features", "pixels"):
             raise ConfigError(f"kind is {kind!r}; it is 'features' or 'pixels'")
         crops = scenes.num_crops if kind == "features" else 1
-        index = {"first": 0, "random": None}.get(crop, -1) if isinstance(crop, str) else crop
-        if index is not None and not 0 <= index < crops:
-            raise ConfigError(
-                f"crop is {crop!r}; give 'first', 'random', or an index below {crops} for {kind}"
-            )
+        index = crop_index(crop, crops, kind)
         if kind == "pixels" and not all(scene.has_pictures for scene in scenes.scenes):
             without = next(scene.name for scene in scenes.scenes if not scene.has_pictures)
             raise SceneError(

@@ -19,15 +19,19 @@ __all__ = ["FeatureFrames", "PictureFrames", "shrink_pictures"]
 
 
 class FeatureFrames(nn.Module):
-    """Precomputed features of frames: a table of all states, crop 0, that stays out of the ``state_dict``.
+    """Precomputed features of frames: a table of all states that stays out of the ``state_dict``.
+
+    The table holds crop 0, in evaluation mode always; :meth:`show` puts other crops in its place for
+    training.
 
     Args:
         features: (S, C, F) float32 of all states, as in ``SceneSet.features``. Of a lazily opened set the
             rows that are asked for are read, normalized and kept (:class:`~vusfa.scenes.features.SceneRows`).
         lookup: keep the table; ``False`` for an agent that is handed features.
         normalize: bring every feature to mean 0 and deviation 1 over the S states. The 2 F numbers are
-            part of the ``state_dict``, because the weights behind them mean nothing with others. A feature
-            that is the same in all states stays near 0, with a warning that names it.
+            part of the ``state_dict``, because the weights behind them mean nothing with others. They are
+            those of crop 0. A feature that is the same in all states stays near 0, with a warning that names
+            it.
 
     Raises:
         ConfigError: ``normalize``, and no feature changes at all.
@@ -42,6 +46,7 @@ class FeatureFrames(nn.Module):
     mean: Tensor
     deviation: Tensor
     _converted: Tensor | None
+    _shown: Tensor | None = None
 
     def __init__(self, features: Tensor | LazyFeatures, lookup: bool = True, normalize: bool = False) -> None:
         super().__init__()
@@ -84,6 +89,8 @@ class FeatureFrames(nn.Module):
         if self._rows is not None:
             return for_autocast(self._rows(_all_of(self, ids), self._read))
         table, device = self.table, self.table.device.type
+        if self._shown is not None and self.training:
+            table = self._shown
         if torch.is_autocast_enabled(device):
             if self._converted is None or self._converted.dtype != torch.get_autocast_dtype(device):
                 self._converted = for_autocast(table)
@@ -95,9 +102,31 @@ class FeatureFrames(nn.Module):
         assert self._features is not None
         return self.encode(self._features.of_scene(scene)[:, 0].to(self.table.device))
 
-    def _apply(self, fn: Any, recurse: bool = True) -> Any:
-        """As every move of a module; what autocast converted is converted anew, what was read, read anew."""
+    def show(self, features: Tensor | None) -> None:
+        """Look up other features in training mode; evaluation mode looks up crop 0.
+
+        Args:
+            features: (S, F) of all states, as the scenes have them, such as a crop of each drawn at random;
+                None: crop 0 again.
+
+        >>> frames = FeatureFrames(torch.zeros(3, 2, 8))
+        >>> frames.show(torch.ones(3, 8))
+        >>> frames.lookup(torch.tensor(1)).sum(), frames.eval().lookup(torch.tensor(1)).sum()
+        (tensor(8.), tensor(0.))
+        """
+        self._shown = None if features is None else self.encode(features.to(self.table.device))
         self._converted = None
+
+    def train(self, mode: bool = True) -> FeatureFrames:
+        """Switch between training and evaluation; what autocast converted is converted anew."""
+        if mode != self.training:
+            self._converted = None
+        return super().train(mode)
+
+    def _apply(self, fn: Any, recurse: bool = True) -> Any:
+        """As every move of a module: what autocast converted is converted anew, what was read is read anew,
+        and crop 0 is shown."""
+        self._converted = self._shown = None
         if self._rows is not None:
             self._rows.clear()
         return super()._apply(fn, recurse)
@@ -116,7 +145,7 @@ class FeatureFrames(nn.Module):
         mean, deviation = mean.to(self.table), deviation.to(self.table)
         if not (torch.equal(mean, self.mean) and torch.equal(deviation, self.deviation)):
             self.table.copy_((self.table * self.deviation + self.mean - mean) / deviation)
-            self._converted = None
+            self._converted = self._shown = None
             if self._rows is not None:
                 self._rows.clear()
 

@@ -19,6 +19,7 @@ from vusfa.report.result_tables import (
     model_rows,
     run_rows,
 )
+from vusfa.report.robustness import robustness_table
 from vusfa.report.success_plot import draw_success
 from vusfa.report.unseen import unseen_table
 from vusfa.scenes import SceneSet
@@ -46,7 +47,7 @@ def print_tables(
     no episode is run: the numbers come from the episodes in RESULTS.
 
     Args:
-        experiments: folders of results, shown together; or generalise alone.
+        experiments: folders of results, shown together; or generalise or robustness alone.
         results: their folder.
         out: folder for the CSV files; RESULTS/tables when not given.
         docs: write the tables that the documentation shows to this folder (docs/generated), and print none.
@@ -61,6 +62,8 @@ def print_tables(
             print(path)
     elif experiments == ["generalise"]:
         print(unseen_table(read_runs(results, "generalise")))
+    elif experiments == ["robustness"]:
+        print(robustness_table(read_runs(results, "robustness")))
     else:
         folder = check_folder(out or results / "tables", "out")
         world = SceneSet.open(scenes) if scenes else None

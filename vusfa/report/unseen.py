@@ -15,7 +15,7 @@ from vusfa.experiments.runs import Run
 from vusfa.report.markdown import markdown
 from vusfa.report.result_tables import COMPARED
 
-__all__ = ["unseen_table"]
+__all__ = ["policy_sums", "unseen_table"]
 
 _GAP = "in 100, less the random walk"
 
@@ -36,10 +36,10 @@ def unseen_table(runs: Sequence[Run]) -> str:
     if len({tuple(run.info["tested_in"]) for run in runs}) > 1:
         raise ResultError("the runs were tested in different rooms; show those of one set of rooms")
     tables = [run.rows() for run in runs]
-    baseline, scene = _sums(tables, "exact")
+    baseline, scene = policy_sums(tables, "exact")
     rows = []
     for mode in runs[0].episodes:
-        sums, _ = _sums(tables, mode)
+        sums, _ = policy_sums(tables, mode)
         means = {name: bootstrap_mean(sums[name], scene) for name in COMPARED}
         gap = paired_difference(sums["success_100"], baseline["success_100"], scene)
         rows.append({"policy": mode, "seeds": len(runs), **means, _GAP: gap})
@@ -48,7 +48,8 @@ def unseen_table(runs: Sequence[Run]) -> str:
     return markdown(rows, ["policy", "seeds", *COMPARED, _GAP])
 
 
-def _sums(tables: Sequence[pd.DataFrame], mode: str) -> tuple[dict[str, Sums], Tensor]:
+def policy_sums(tables: Sequence[pd.DataFrame], mode: str) -> tuple[dict[str, Sums], Tensor]:
+    """Sums (K, G) of the compared metrics of K runs in one mode, and the scene (G,) of each goal."""
     found = {}
     for name in COMPARED:
         sums = goal_sums([table[table["mode"] == mode] for table in tables], name)

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from vusfa.errors import SceneError
-from vusfa.limits import MAX_FAULTS, TABLE_STATES
+from vusfa.limits import MAX_FAULTS, TABLE_STATES, brief
 from vusfa.scenes.graph import shortest_path_distances
 from vusfa.scenes.hdf5 import row_blocks
 
@@ -26,6 +26,7 @@ __all__ = [
     "DATASETS",
     "array_faults",
     "check_alike",
+    "check_same_graph",
     "distance_faults",
     "feature_faults",
     "graph_faults",
@@ -233,6 +234,28 @@ def array_faults(
         if name in sound:
             faults += pose_faults(name, sound[name])
     return faults
+
+
+def check_same_graph(one: Scene, other: Scene) -> None:
+    """Check that two scenes have the same states and actions, such as two renderings of a room.
+
+    Raises:
+        SceneError: they have not; the message names both files and the first difference.
+    """
+    if one.actions != other.actions:
+        found = f"their actions are {brief(one.actions)} and {brief(other.actions)}"
+    elif one.num_states != other.num_states:
+        found = f"they have {one.num_states} and {other.num_states} states"
+    elif differing := (one.graph != other.graph).nonzero().tolist():
+        state, action = differing[0]
+        ends = [int(scene.graph[state, action]) for scene in (one, other)]
+        found = f"from state {state} action {action} leads to {ends[0]} and to {ends[1]}"
+    else:
+        return
+    places = [f"scene {scene.name!r}" if scene.path is None else scene.path for scene in (one, other)]
+    raise SceneError(
+        f"{places[0]} and {places[1]} are of different rooms: {found}; give renderings of one room"
+    )
 
 
 def check_alike(scenes: Sequence[Scene]) -> None:

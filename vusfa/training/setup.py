@@ -12,6 +12,7 @@ from torchrl.collectors import BaseCollector
 
 from vusfa.algorithms import make_algorithm, threads_per_step
 from vusfa.envs import SceneObservation, SceneRotation, resolve_goals
+from vusfa.envs.observation import crop_index
 from vusfa.envs.rotation import Rotation
 from vusfa.envs.scene_env import usable_device
 from vusfa.errors import ConfigError
@@ -79,7 +80,8 @@ def make_trainer(
     note = None if settings["resume"] else algorithm.prepare()
     if ranks.size > 1:
         algorithm.share_statistics(ranks.mean)
-    observation = make_observation(agent, scenes, task.pop("crop"))
+    crop = task.pop("crop")
+    observation = make_observation(agent, scenes, crop)
     transforms = [*([observation] if observation is not None else []), *agent.make_env_transforms()]
     env = partial(make_env, scenes, transforms, history=agent.config["history"], device=device, **task)
     if rotation is not None:
@@ -107,7 +109,7 @@ def make_trainer(
         "optimizer": optimizer,
         "settings": settings,
         "overrides": overrides,
-        "observation": observation,
+        "observation": observation if crop == "first" else make_observation(agent, scenes),
         "note": note,
         "ranks": ranks,
     }
@@ -162,7 +164,7 @@ def make_observation(agent: Agent, scenes: SceneSet, crop: str = "first") -> Sce
     Args:
         agent: the agent.
         scenes: the world.
-        crop: of :class:`~vusfa.envs.SceneObservation`, for features.
+        crop: of :class:`~vusfa.envs.SceneObservation`, for features; checked for an agent that reads ids.
 
     >>> scenes = SceneSet.bundled(["bathroom"])
     >>> make_observation(make_agent("gvf", scenes=scenes, observation="features"), scenes).kind
@@ -170,6 +172,11 @@ def make_observation(agent: Agent, scenes: SceneSet, crop: str = "first") -> Sce
     """
     kind = agent.config["observation"]
     if kind == "index":
+        if crop_index(crop, scenes.num_crops) != 0 and scenes.is_lazy:
+            raise ConfigError(
+                f"env.crop is {crop}: an agent that reads ids sees other crops of scenes in memory only; give"
+                " fewer scenes, or env.crop=first"
+            )
         return None
     if kind == "features":
         return SceneObservation(scenes, "features", crop=crop)

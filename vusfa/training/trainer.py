@@ -60,7 +60,7 @@ class Trainer:
         make_collector: called with the policy that collects.
         settings: all settings, as plain data.
         overrides: the command line that made them; kept in checkpoints.
-        observation: transform between world and agent, or None.
+        observation: transform between world and agent in evaluations, or None.
         note: message of the algorithm's preparation, or None.
         heads: of active scenes, where only these are computed; for a single collector.
         ranks: of a data-parallel training, each with a trainer; by default this process alone.
@@ -100,8 +100,7 @@ class Trainer:
         self.acting = InferencePolicy(agent)
         self._make_collector = partial(make_collector, self.acting)
         self.frames, self.updates, self.seconds = 0, 0, 0.0
-        self.run_id = secrets.token_hex(4)
-        self.validation = dict(NO_VALIDATION)
+        self.run_id, self.validation = secrets.token_hex(4), dict(NO_VALIDATION)
         self.episodes, self.terms = EpisodeMeter(scenes, goals), MeanMeter()
         self._collector: BaseCollector | None = None
         self._waiting: tuple[str | Path, Mapping[str, Any]] | None = None  # a checkpoint, for the collector
@@ -156,6 +155,7 @@ class Trainer:
             the batch, and the numbers to log: the losses' terms and the gradient's norm.
         """
         began = time.monotonic()
+        self.algorithm.show_crops()
         self.algorithm.schedule(self.frames)
         batch = self.collect(batches)
         if self.heads is not None:
@@ -171,14 +171,14 @@ class Trainer:
                 terms = dict(self.algorithm.losses(part))
             norm = self._descend(terms)
         for _ in range(self.algorithm.replay_steps):
+            self.algorithm.show_crops()
             with self._precision():
                 more = dict(self.algorithm.replay_losses())
             self._descend(more)
             terms.update(more)
         self.algorithm.after_step()
         terms = {name: value.detach() for name, value in terms.items()} | {"grad_norm": norm}
-        self.frames += batch.numel() * self.ranks.size
-        self.updates += 1
+        self.frames, self.updates = self.frames + batch.numel() * self.ranks.size, self.updates + 1
         self.episodes.update(batch)
         self.terms.update(terms)
         self.seconds += time.monotonic() - began
