@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import multiprocessing.util
 import os
 import random
 import signal
@@ -44,6 +45,9 @@ def start(
     code: object = 70
     try:
         os.setsid()
+        # as multiprocessing does where it forks itself: else descriptors that are sent to workers are looked
+        # for in the process of the tests, once one of these has sent any
+        multiprocessing.util._run_after_forkers()  # type: ignore[attr-defined]
         written = os.open(output or folder.with_suffix(".txt"), os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
         os.dup2(written, 1)
         os.dup2(written, 2)

@@ -18,7 +18,7 @@ from pathlib import Path, PurePosixPath
 from typing import IO, Any
 
 from vusfa.errors import ConfigError, SceneError
-from vusfa.limits import MAX_DECODED_PICTURES, MAX_STATE_BYTES, brief
+from vusfa.limits import MAX_STATE_BYTES, brief
 from vusfa.reading import BoundedZip, read_yaml
 from vusfa.scenes import store
 from vusfa.scenes.hdf5 import opened
@@ -69,24 +69,34 @@ def archives(config: str | os.PathLike[str] | None = None) -> dict[str, Archive]
 def _archive(where: str, name: str, entry: dict[str, Any]) -> Archive:
     keys = {item.name for item in fields(Archive)} - {"name"}
     patience_keys = {item.name for item in fields(Patience)}
-    patience = entry.get("patience") or {}
-    wrong = sorted(set(entry) - keys) + [f"patience.{key}" for key in sorted(set(patience) - patience_keys)]
+    patience = {} if entry.get("patience") is None else entry["patience"]
+    if not isinstance(patience, dict):
+        raise ConfigError(f"{where}: patience is {brief(patience)}; map {', '.join(sorted(patience_keys))}")
+    wrong = [*(entry.keys() - keys), *(f"patience.{key}" for key in patience.keys() - patience_keys)]
     if wrong:
-        raise ConfigError(f"{where}: there is no key {wrong[0]!r}; the keys are {', '.join(sorted(keys))}")
+        least = min(wrong, key=str)
+        raise ConfigError(f"{where}: there is no key {brief(least)}; the keys are {', '.join(sorted(keys))}")
     mirrors, scenes = entry.get("mirrors"), entry.get("scenes")
     if not isinstance(mirrors, list) or not all(isinstance(url, str) for url in mirrors) or not mirrors:
         raise ConfigError(f"{where}: mirrors is {brief(mirrors)}; list one address or more")
-    if not isinstance(scenes, dict) or not all(isinstance(count, int) for count in scenes.values()):
+    counts = scenes.values() if isinstance(scenes, dict) else [None]
+    if not scenes or not all(type(count) is int and count > 0 for count in counts):
         raise ConfigError(f"{where}: scenes is {brief(scenes)}; map each name to its number of states")
-    wrong_numbers = [
-        key for key, value in patience.items() if not isinstance(value, int | float) or value <= 0
-    ]
-    if wrong_numbers:
-        key = wrong_numbers[0]
-        raise ConfigError(f"{where}: patience.{key} is {brief(patience[key])}; give a number above 0")
+    archive = str(entry.get("archive") or PurePosixPath(mirrors[0]).name)
+    for what, given in [("archive", archive), *(("scenes", str(scene)) for scene in scenes)]:
+        if (
+            given in ("", ".", "..")
+            or Path(given).name != given
+            or not given.isprintable()
+            or len(given) > 200
+        ):
+            raise ConfigError(f"{where}: {what} names {brief(given)}, which is no name of a file; give one")
+    for key, value in patience.items():
+        if type(value) not in ((int,) if key == "attempts" else (int, float)) or not 0 < value < 1e6:
+            raise ConfigError(f"{where}: patience.{key} is {brief(value)}; give a number above 0")
     return Archive(
         name,
-        str(entry.get("archive") or PurePosixPath(mirrors[0]).name),
+        archive,
         tuple(mirrors),
         {str(scene): count for scene, count in scenes.items()},
         Patience(**patience),
@@ -96,7 +106,7 @@ def _archive(where: str, name: str, entry: dict[str, Any]) -> Archive:
 
 def arrived_faults(path: Path, num_states: int) -> list[str]:
     """Faults of a scene file that should have this many states; an empty list for a sound one."""
-    faults = store.validate(path, MAX_DECODED_PICTURES)  # damage on the way shows in the archive's CRC
+    faults = store.validate(path)  # damage on the way shows in the archive's CRC
     if not faults:
         with opened(path) as file:
             found = len(file["graph"])
