@@ -10,12 +10,15 @@ from __future__ import annotations
 from typing import Any
 
 from vusfa.cli.launch import launch
+from vusfa.cli.ray_train import train_on_ray
 from vusfa.experiments.training import train
 from vusfa.report.media import draw_media
 
 
 def main(settings: dict[str, Any], overrides: list[str]) -> int:
-    """Train and evaluate."""
+    """Train and evaluate, here or on a cluster."""
+    if settings["cluster"]["kind"]:
+        return train_on_ray(settings, overrides, draw_media)
     return train(settings, overrides, draw_media).exit_code
 
 

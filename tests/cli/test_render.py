@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import pickle
 import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import cloudpickle
 import numpy as np
 import pytest
 
+from vusfa.cluster.cells import LAUNCHERS
 from vusfa.errors import SceneError
 from vusfa.scenes import Scene
 from vusfa.scenes.provenance import Provenance
@@ -126,6 +129,26 @@ def test_many_rooms_fill_a_folder_and_a_second_run_does_the_rest(
     assert result.exit_code == 0, result.stderr
     assert "2 of 3 files are there already" in result.stderr
     assert [name for name, _ in painted] == [f"bathroom-{seed}" for seed in (1, 2, 5, 2)]
+
+
+def test_a_launcher_renders_rooms(
+    run: Callable[..., Any],
+    tmp_path: Path,
+    painted: list[tuple[str, Variation]],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def travel(jobs: Any, options: Any) -> None:
+        for job in jobs:
+            pickle.loads(cloudpickle.dumps(job))()
+
+    monkeypatch.setitem(LAUNCHERS, "travel", travel)
+    words = ["render-rooms", tmp_path / "rooms", "kind=[bathroom]", "seeds=[1,5]", "cells=20"]
+    result = run(*words, "launcher=travel")
+    assert result.exit_code == 0, result.stderr
+    assert [name for name, _ in painted] == ["bathroom-1", "bathroom-5"]
+    assert sorted(path.name for path in (tmp_path / "rooms").iterdir()) == ["bathroom-1.h5", "bathroom-5.h5"]
+    (tmp_path / "rooms" / "bathroom-1.h5").unlink()
+    assert "no such launcher" in run(*words, "launcher=rai").stderr
 
 
 def test_every_change_of_a_room_has_its_folder(

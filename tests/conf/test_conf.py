@@ -34,6 +34,7 @@ def test_every_file_opens_with_the_line_that_launches_it(path: Path):
 def test_the_groups_mirror_the_package():
     assert {path.name for path in CONF.iterdir() if path.is_dir() and path.name != "__pycache__"} == {
         "agent",
+        "cluster",
         "collector",
         "env",
         "evaluation",
@@ -125,7 +126,9 @@ def test_the_numbers_of_controlled(settings):
         "options": {"eps": 1e-5, "fused": True},
     }
     assert cfg.collector == {"kind": "single", "num_envs": 256, "rollout": 50, "num_workers": 1} | {
-        "timeout": 300.0
+        "timeout": 300.0,
+        "address": None,
+        "resources": {},
     }
     assert cfg.env.goal_sampling == "episode"
     assert cfg.entropy == {"start": 0.005, "end": 0.001, "horizon": 6_000_000}

@@ -130,7 +130,8 @@ def test_commands_exist(page: Path) -> None:
             if word.startswith("-") and command != "train":  # what Hydra takes is its own
                 assert name in options, f"{page.name}: {shlex.join(words)} has no option {name}"
             elif "=" in word and command in ("train", "table1", "generalise"):
-                known = name in settings_of_training() or name.startswith("objective.terms.")
+                known = name in settings_of_training() or name.startswith(("objective.terms.", "hydra"))
+                known = known or f"--{name.replace('_', '-')}" in options
                 assert known, f"{page.name}: no setting {name}"
 
 

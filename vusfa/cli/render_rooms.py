@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import typer
 
@@ -15,6 +15,8 @@ from vusfa.errors import ConfigError, VusfaError
 from vusfa.limits import brief
 
 if TYPE_CHECKING:
+    from vusfa.sources.backbones import Backbone
+    from vusfa.sources.render import Rendered
     from vusfa.sources.render.plan import Plan
     from vusfa.sources.render.variation import Variation
 
@@ -84,6 +86,34 @@ def _jobs(
             yield _Job(folder / change / f"{name}.h5", draw, variation)
 
 
+def _render(
+    job: _Job,
+    *,
+    backbone: Callable[[], Backbone],
+    width: int | None,
+    samples: int | None,
+    scalar: bool,
+    threads: int | None,
+) -> Rendered:
+    from vusfa.sources.compact import compact
+    from vusfa.sources.render.backend import Backend
+    from vusfa.sources.render.room import render_room
+
+    job.target.parent.mkdir(parents=True, exist_ok=True)
+    raw = job.target.with_name(f".{job.target.name}.raw.h5")
+    rendered = render_room(
+        with_camera(job.draw(), width, samples),
+        raw,
+        backbone=backbone(),
+        backend=Backend("scalar_rgb") if scalar else None,
+        threads=threads,
+        variation=job.variation,
+    )
+    compact(raw, job.target)
+    raw.unlink()
+    return replace(rendered, path=job.target)
+
+
 def render_rooms(
     folder: Annotated[
         Path, typer.Argument(help="Folder to fill; files that exist are kept.", show_default=False)
@@ -113,6 +143,13 @@ def render_rooms(
     weights: Weights = None,
     scalar: Scalar = False,
     threads: Threads = None,
+    launcher: Annotated[
+        str,
+        typer.Option(help="What renders: serial (one room after the other), local, slurm or ray."),
+    ] = "serial",
+    launcher_options: Annotated[
+        list[str] | None, typer.Option(help="Options of the launcher: [address=HOST:6379,num_cpus=2].")
+    ] = None,
 ) -> None:
     """Render many rooms into a folder, as small files (see `vusfa scenes compact`).
 
@@ -138,30 +175,21 @@ def render_rooms(
         typer.echo(f"{len(jobs) - len(waiting)} of {len(jobs)} files are there already", err=True)
     if not waiting:
         return
+    from vusfa.cluster.cells import Cell, run_cells
     from vusfa.sources.backbones import load_backbone
-    from vusfa.sources.compact import compact
-    from vusfa.sources.render.backend import Backend
-    from vusfa.sources.render.room import render_room
 
-    network = load_backbone(backbone, weights=weights)
     check_folder(folder.absolute(), "the folder of the rooms")
+    how: dict[str, Any] = {"width": width, "samples": samples, "scalar": scalar, "threads": threads}
+    if launcher != "serial" or launcher_options:
+        work = partial(_render, backbone=partial(load_backbone, backbone, weights=weights), **how)
+        made = [Cell(job.target, partial(work, job)) for job in waiting]
+        return run_cells(made, launcher, launcher_options or [])
+    network = load_backbone(backbone, weights=weights)
     failed: list[str] = []
     with progress("rendering", len(waiting), "rooms") as advance:
         for job in waiting:
-            job.target.parent.mkdir(parents=True, exist_ok=True)
-            raw = job.target.with_name(f".{job.target.name}.raw.h5")
             try:
-                rendered = render_room(
-                    with_camera(job.draw(), width, samples),
-                    raw,
-                    backbone=network,
-                    backend=Backend("scalar_rgb") if scalar else None,
-                    threads=threads,
-                    variation=job.variation,
-                )
-                compact(raw, job.target)
-                raw.unlink()
-                typer.echo(str(replace(rendered, path=job.target)))
+                typer.echo(str(_render(job, backbone=lambda: network, **how)))
             except VusfaError as error:
                 failed.append(f"{job.target}: {error}")
                 typer.echo(f"error: {failed[-1]}", err=True)

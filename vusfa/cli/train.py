@@ -36,6 +36,7 @@ def train(context: typer.Context) -> None:
     """Train an agent and evaluate it: vusfa train SETTING=VALUE ..."""
     try:
         from vusfa.cli.launch import launch
+        from vusfa.cli.ray_train import train_on_ray
         from vusfa.experiments import training
         from vusfa.report.media import draw_media
     except ModuleNotFoundError as error:
@@ -50,6 +51,8 @@ def train(context: typer.Context) -> None:
             raise typer.Exit(2)
 
     def job(settings: dict[str, Any], overrides: list[str]) -> int:
+        if settings["cluster"]["kind"]:
+            return train_on_ray(settings, overrides, draw_media)
         return training.train(settings, overrides, draw_media).exit_code
 
     sys.argv = ["vusfa train", *context.args]

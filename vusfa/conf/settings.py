@@ -16,6 +16,7 @@ __all__ = [
     "MAX_STEPS",
     "POSITIVE",
     "AgentSettings",
+    "ClusterSettings",
     "CollectorSettings",
     "EarlyStoppingSettings",
     "EntropySettings",
@@ -142,13 +143,27 @@ class OptimSettings:
 
 @dataclass
 class CollectorSettings:
-    """Settings of :func:`vusfa.training.make_collector`."""
+    """Settings of :func:`vusfa.training.make_collector`; the last two are of ``collector=ray``."""
 
     kind: str
     num_envs: int
     rollout: int
     num_workers: int
     timeout: float | None = 300.0
+    address: str | None = None
+    resources: dict[str, float] = field(default_factory=dict)
+
+
+@dataclass
+class ClusterSettings:
+    """Settings of :func:`vusfa.cli.ray_train.train_on_ray`; kind null: learn in this process."""
+
+    kind: str | None = None
+    workers: int = 2
+    min_workers: int | None = None
+    address: str | None = None
+    resources: dict[str, float] = field(default_factory=dict)
+    max_failures: int = 3
 
 
 @dataclass
@@ -228,6 +243,7 @@ class Settings:
     overwrite: bool
     by_model: dict[str, Any] = field(default_factory=dict)
     skip_broken_scenes: bool = False
+    cluster: ClusterSettings = field(default_factory=ClusterSettings)
 
 
 def flat(settings: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:

@@ -6,17 +6,20 @@ import dataclasses
 import shutil
 import sys
 import time
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 from omegaconf import open_dict
 
+from vusfa.cluster.cells import Cell, run_cells
 from vusfa.experiments.measure import choose_checkpoint, measure_checkpoint
 from vusfa.experiments.runs import read_run, write_run
 from vusfa.experiments.training import compose_settings, train
 from vusfa.files import replacing
 from vusfa.modules.config import MODELS
 
-__all__ = ["checkpoints", "table1"]
+__all__ = ["checkpoints", "table1", "table1_cell"]
 
 
 def checkpoints(folder: Path, overrides: list[str], stages: list[float]) -> list[Path]:
@@ -54,6 +57,8 @@ def table1(
     runs: Path = Path("runs"),
     manifest: Path | None = None,
     again: bool = False,
+    launcher: str = "serial",
+    launcher_options: list[str] = [],  # noqa: B006
 ) -> None:
     """The paper's Table 1: train, choose a checkpoint and evaluate, per model and seed.
 
@@ -70,27 +75,49 @@ def table1(
         runs: where trainings keep their checkpoints.
         manifest: of episodes; that of the bundled rooms when not given.
         again: evaluate existing results again, from the chosen checkpoints.
+        launcher, launcher_options: what runs the cells: serial, local, slurm or ray (docs/cluster.md).
     """
-    for seed in seeds:
-        for model in models:
-            name, began = f"{model}-{seed}", time.monotonic()
-            run, there = runs / experiment / name, (results / experiment / name / "cell.json").exists()
-            if there and not again:
-                print(f"{results / experiment / name}: already there")
-                continue
-            if there:
-                info = read_run(results, experiment, name).info
-                chosen, settings = run / info["checkpoint"], info["overrides"]
-                facts = {key: info[key] for key in ("validation_spl", "cell_s") if key in info}
-                facts |= {"model": model, "row": model} if model == "untrained" else {}
-            else:
-                untrained = model == "untrained"
-                settings = [*overrides, f"agent.model={'vusfa' if untrained else model}", f"seed={seed}"]
-                kept = checkpoints(run, settings, [0.0] if untrained else sorted(stages))
-                scores = choose_checkpoint(kept, manifest)
-                chosen = next(iter(scores))
-                facts = {"validation_spl": {path.name: score for path, score in scores.items()}}
-                facts |= {"model": model, "row": model} if untrained else {}
-            measured = measure_checkpoint(chosen, experiment, name, settings, manifest)
-            facts.setdefault("cell_s", round(time.monotonic() - began, 1))
-            print(write_run(results, dataclasses.replace(measured, info={**measured.info, **facts})))
+    places: dict[str, Any] = {
+        "experiment": experiment,
+        "results": results,
+        "runs": runs,
+        "manifest": manifest,
+    }
+    cells = [
+        Cell(
+            results / experiment / f"{model}-{seed}",
+            partial(table1_cell, overrides, model, seed, stages, places),
+        )
+        for seed in seeds
+        for model in models
+    ]
+    run_cells(cells, launcher, launcher_options, again)
+
+
+def table1_cell(
+    overrides: list[str], model: str, seed: int, stages: list[float], places: dict[str, Any]
+) -> Path:
+    """Train and evaluate one model with one seed; of an existing result only the evaluation is made again.
+
+    Args:
+        overrides, stages: of :func:`table1`.
+        model, seed: of the cell.
+        places: further arguments of :func:`table1` by name.
+    """
+    experiment, results, runs, manifest = (places[n] for n in ("experiment", "results", "runs", "manifest"))
+    name, began, untrained = f"{model}-{seed}", time.monotonic(), model == "untrained"
+    run, facts = runs / experiment / name, dict[str, Any]()
+    if (results / experiment / name / "cell.json").exists():
+        info = read_run(results, experiment, name).info
+        chosen, settings = run / info["checkpoint"], info["overrides"]
+        facts = {key: info[key] for key in ("validation_spl", "cell_s") if key in info}
+    else:
+        settings = [*overrides, f"agent.model={'vusfa' if untrained else model}", f"seed={seed}"]
+        kept = checkpoints(run, settings, [0.0] if untrained else sorted(stages))
+        scores = choose_checkpoint(kept, manifest)
+        chosen = next(iter(scores))
+        facts["validation_spl"] = {path.name: score for path, score in scores.items()}
+    facts |= {"model": model, "row": model} if untrained else {}
+    measured = measure_checkpoint(chosen, experiment, name, settings, manifest)
+    facts.setdefault("cell_s", round(time.monotonic() - began, 1))
+    return write_run(results, dataclasses.replace(measured, info={**measured.info, **facts}))

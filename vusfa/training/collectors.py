@@ -5,6 +5,7 @@
 ``multi_sync``   worker processes collect with the same weights and wait for each other; a batch has all rows.
 ``multi_async``  worker processes never wait: a batch has the rows of the first that is ready. Weights are in
                  shared memory, so an update reaches workers in mid-rollout: A3C.
+``ray``          as ``multi_sync``; the workers are actors of Ray: :mod:`vusfa.cluster.ray_workers`.
 ``hogwild``      worker processes train, too: :mod:`vusfa.training.hogwild`.
 ===============  ============================================================================================
 
@@ -13,7 +14,7 @@ Rows get the same goals however they are spread over processes.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from functools import partial
 from pathlib import Path
@@ -26,6 +27,7 @@ from torchrl.collectors import BaseCollector, Collector, MultiAsyncCollector, Mu
 from torchrl.envs import EnvBase, TransformedEnv
 from torchrl.envs.transforms import Compose, Transform
 
+from vusfa.cluster.ray_workers import RayWorkers
 from vusfa.envs import TargetNavEnv
 from vusfa.errors import CheckpointError, ConfigError, WorkerError
 from vusfa.limits import brief
@@ -47,7 +49,7 @@ __all__ = [
     "rows_per_worker",
 ]
 
-KINDS = ("single", "multi_sync", "multi_async", "hogwild")
+KINDS = ("single", "multi_sync", "multi_async", "ray", "hogwild")
 
 MakeEnv = Callable[..., EnvBase]
 
@@ -125,25 +127,29 @@ def make_collector(
     autocast: bool = False,
     timeout: float | None = None,
     first_goal: int = 0,
+    address: str | None = None,
+    resources: Mapping[str, float] | None = None,
 ) -> BaseCollector:
     """Make a collector that never ends; the caller counts the frames.
 
     Args:
-        kind: ``"single"``, ``"multi_sync"`` or ``"multi_async"``.
+        kind: ``"single"``, ``"multi_sync"``, ``"multi_async"`` or ``"ray"``.
         make_env: called with ``batch_size``, ``first_goal`` and ``seed``, in the worker; picklable.
         policy: writes ``action``; workers get its weights through shared memory.
         num_envs: environments in all.
-        rollout: steps T of each environment in a batch; ``single`` and ``multi_sync`` give batches of
-            num_envs x T frames, ``multi_async`` of num_envs / num_workers x T.
-        num_workers: worker processes, of the two ``multi_`` kinds.
+        rollout: steps T of each environment in a batch; ``multi_async`` gives batches of num_envs /
+            num_workers x T frames, the others of num_envs x T.
+        num_workers: worker processes, of all kinds but ``single``.
         seed: of the environments and the workers' draws of actions.
         autocast: workers compute in bfloat16 where that is safe; in this process the caller decides, by
             collecting within :class:`torch.autocast`.
         timeout: seconds after which a worker that sends nothing counts as dead; None: never.
         first_goal: of the first environment, where each keeps its goal (``single``).
+        address, resources: of :class:`~vusfa.cluster.ray_workers.RayWorkers`, for ``ray``.
 
     Raises:
-        ConfigError: see :func:`rows_per_worker`.
+        ConfigError: see :func:`rows_per_worker`; for ``ray`` also
+            :func:`~vusfa.cluster.ray_workers.connected`.
         WorkerError: the workers cannot start.
     """
     rows = rows_per_worker(kind, num_envs, num_workers, rollout)
@@ -163,6 +169,11 @@ def make_collector(
         partial(make_env, batch_size=[rows], first_goal=worker * rows, seed=seed + worker)
         for worker in range(num_workers)
     ]
+    if kind == "ray":
+        given: dict[str, Any] = {"seed": seed, "autocast": autocast, "timeout": timeout, "address": address}
+        given |= {"frames_per_batch": num_envs * rollout, "resources": resources or {}}
+        workers: Any = RayWorkers(makers, policy, **given)
+        return workers
     threads = torch.get_num_threads()  # without num_threads= the collector takes some of this process's away
     shared |= {
         "num_threads": threads,
@@ -206,7 +217,8 @@ def opened(make: Callable[[], BaseCollector]) -> Iterator[BaseCollector]:
 def close_collector(collector: BaseCollector) -> None:
     """End a collector's processes."""
     collector.shutdown()
-    end_weight_sharing(collector)  # an exception's traceback is enough to keep it alive
+    if not isinstance(collector, RayWorkers):
+        end_weight_sharing(collector)  # an exception's traceback is enough to keep it alive
 
 
 def coming_goals(collector: Collector) -> Tensor:

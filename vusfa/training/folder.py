@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import fcntl
 import itertools
 import os
 import re
@@ -13,6 +12,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any
 
+from vusfa.cluster.locks import FileLock, LockedError
 from vusfa.errors import ConfigError
 from vusfa.files import check_folder, remove_leftovers
 
@@ -73,7 +73,7 @@ class RunFolder:
         self._settings, self._unnamed = settings, path is None
         self.path = check_folder(default_folder(settings) if path is None else path, "folder")
         self._made: list[Path] = []
-        self._lock: int | None = None
+        self._lock: FileLock | None = None
         if not self._unnamed:
             self._refuse_other_run()
 
@@ -90,10 +90,8 @@ class RunFolder:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        with suppress(OSError):
-            (self.path / _LOCK).unlink()
         if self._lock is not None:
-            os.close(self._lock)
+            self._lock.release()
         for place in reversed(self._made):  # a run that did not begin leaves nothing
             with suppress(OSError):
                 place.rmdir()
@@ -116,26 +114,14 @@ class RunFolder:
 
     def _claim(self) -> None:
         """Take the lock, which ends with this process in any case."""
-        self._lock = os.open(self.path / _LOCK, os.O_RDWR | os.O_CREAT, 0o644)
+        self._lock = FileLock(self.path / _LOCK)
         try:
-            fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError as error:
-            writer = os.read(self._lock, 20).decode("ascii", "replace")
-            os.close(self._lock)
-            self._lock = None
+            self._lock.acquire()
+        except LockedError as error:
             raise ConfigError(
-                f"folder is '{self.path}', where process {writer} is writing a run; wait for it, or give"
-                " another folder"
+                f"folder is '{self.path}', where {error.owner} is writing a run; wait for it, or give another"
+                " folder"
             ) from error
-        except OSError:
-            pass  # a file system without locks
-        with suppress(FileNotFoundError):
-            if os.path.samestat(os.fstat(self._lock), os.stat(self.path / _LOCK)):
-                os.ftruncate(self._lock, 0)
-                os.write(self._lock, str(os.getpid()).encode())
-                return
-        os.close(self._lock)  # its run has just ended and removed it
-        self._claim()
 
     def _resumes_here(self) -> bool:
         resume = self._settings["resume"]
