@@ -49,8 +49,9 @@ PICTURE_FORMATS = ("JPEG", "PNG")
 MAX_PICTURE_SIDE, MAX_PHOTO_PIXELS = 4096, 90_000_000
 #: Scans of a JPEG file, each of which is decoded over the whole picture. Progressive files have about 10.
 MAX_PICTURE_SCANS = 64
-#: Pictures of a scene that are decoded when it is fetched, evenly spaced. ``vusfa scenes check`` decodes all.
-MAX_DECODED_PICTURES = 500
+#: Pixels of a scene's pictures that are decoded when it is checked, of pictures evenly spaced: about 5 s.
+#: ``vusfa scenes check --all`` decodes all.
+MAX_DECODED_PIXELS = 1 << 28
 #: Size of the decoded pictures that are looked at together.
 MAX_PICTURE_BYTES = 1 << 26
 
@@ -89,6 +90,17 @@ MAX_ZIP_READ = 1 << 22
 MAX_CHECKPOINT_VALUES, MAX_CHECKPOINT_DEPTH = 200_000, 32
 #: Size of a layer that a file may ask for beyond the sizes of its own weights.
 MAX_LAYER = 4096
+
+# ---- agents, environments, evaluations
+
+#: Units of a layer, and frames of an agent's history.
+MAX_UNITS = 1 << 16
+#: Side of the pictures that convolutions see, pixels.
+MAX_CONV_SIDE = 1024
+#: Environments that step together, times the frames of their history.
+MAX_ENV_FRAMES = 1 << 26
+#: Frames of a collector's batch, and episodes of an evaluation.
+MAX_BATCH_FRAMES, MAX_EPISODES = 1 << 28, 1 << 26
 
 # ---- cameras
 

@@ -84,8 +84,11 @@ def test_a_search_begins_after_a_part_of_the_training(scene_file: Path, frames: 
         ("algorithm.path_share=1.5", "path_share is 1.5"),
         ("algorithm.learning_starts=-1", "learning_starts is -1 of total_frames 340000: nothing would be"),
         ("algorithm.learning_starts=340000", "learning_starts is 340000 of total_frames 340000"),
-        ("agent.history=2", "agent.history=1"),
-        ("agent=lstm", "agent.memory=null"),
+        (
+            "agent.history=2",
+            "algorithm=replay_search cannot train an agent with agent.history=2; give agent.hi",
+        ),
+        ("agent=lstm", "agent.memory=lstm; give agent.memory=null, or algorithm=usf"),
         ("agent.observation=features", "agent.observation=index"),
         ("optim=a3c", "optim.kind=a3c_rmsprop"),
         ("objective.gamma=1.0", "replay_search: SearchLoss: gamma is 1.0"),

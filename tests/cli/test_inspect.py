@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import shutil
 from collections.abc import Callable
@@ -13,7 +14,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from vusfa.scenes import Scene
+from vusfa.scenes import Scene, pictures
 from vusfa.scenes.provenance import Provenance
 
 Run = Callable[..., Any]
@@ -185,6 +186,29 @@ def test_check_says_all_faults_of_all_files(run: Run, scene_file: Path, faulty_f
 def test_check_is_silent_about_nothing(run: Run, scene_file: Path) -> None:
     result = run("check", scene_file)
     assert (result.exit_code, result.stdout, result.stderr) == (0, f"{scene_file}: sound\n", "")
+
+
+def test_check_says_how_many_pictures_it_has_decoded(
+    run: Run, scene_file: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Damage in the middle of a picture at the end of a huge file: --all finds it, and the line says so."""
+    with h5py.File(scene_file, "a") as file:
+        raw = file["observation"][()]
+        del file["observation"]
+        noise = np.random.default_rng(0).integers(0, 256, raw.shape, dtype=np.uint8)
+        stored = [io.BytesIO() for _ in noise]
+        for picture, png in zip(noise, stored, strict=True):
+            Image.fromarray(picture).save(png, "PNG")
+        damaged = bytearray(stored[-2].getvalue())  # not sampled: the first, the last, and two between are
+        damaged[len(damaged) // 2] ^= 1
+        pictures.write_jpegs(file, [*(png.getvalue() for png in stored[:-2]), damaged, stored[-1].getvalue()])
+    monkeypatch.setattr("vusfa.limits.MAX_DECODED_PIXELS", 4 * 40 * 48)
+    result = run("check", scene_file)
+    note = "4 of 16 pictures decoded; --all decodes every one"
+    assert (result.exit_code, result.stdout) == (0, f"{scene_file}: sound ({note})\n")
+    every = run("check", scene_file, "--all")
+    assert every.exit_code == 1
+    assert "dataset 'observation_jpeg', state 14: is unusable" in every.stdout
 
 
 def test_compare_says_how_far_two_scenes_are_apart(run: Run, scene_file: Path, make_scene: Any) -> None:

@@ -15,8 +15,8 @@ from torchrl.collectors import Collector
 from torchrl.envs import GymWrapper, StepCounter, TransformedEnv
 from torchrl.envs.utils import RandomPolicy, check_env_specs
 
-from vusfa.envs import TargetNavEnv
-from vusfa.errors import ActionError, ConfigError
+from vusfa.envs import SceneObservation, TargetNavEnv
+from vusfa.errors import ActionError, ConfigError, GoalError
 from vusfa.scenes import Scene, SceneSet
 
 ENV_ID = "vusfa/TargetNav-v0"
@@ -39,17 +39,93 @@ def scenes(make_scene: Callable[..., Scene]) -> SceneSet:
         ({"batch_size": [-1]}, r"batch_size is \[-1\]; give lengths of 1 or more"),
         ({"batch_size": [2, -3]}, r"batch_size is \[2, -3\]; give lengths"),
         ({"batch_size": [0]}, r"batch_size is \[0\]; give lengths"),
+        ({"batch_size": [True]}, r"batch_size is \[True\]; give lengths of 1 or more"),
+        ({"batch_size": True}, r"batch_size is True; give a list, \[64\]"),
+        ({"batch_size": [2.0]}, r"batch_size is \[2.0\]; give lengths"),
+        (
+            {"batch_size": [10**13]},
+            r"batch_size is \[1\d+\]; with history=4 give at most 16,777,216 environments",
+        ),
+        ({"batch_size": [10**5] * 3}, "with history=4 give at most"),
+        ({"batch_size": [2], "history": 10**9}, "with history=1000000000 give at most 0 environments"),
+        ({"history": True}, "history is True; give a whole number"),
+        ({"max_steps": 2.5}, "max_steps is 2.5; give a whole number"),
+        ({"max_steps": 10**30}, r"max_steps is 1\d+; give a whole number below"),
+        ({"first_goal": "1"}, "first_goal is '1'; give a whole number"),
+        ({"seed": True}, "seed is True; give a whole number"),
         ({"seed": -1}, "seed is -1; give a whole number of 0 or more"),
         ({"seed": 1.5}, "seed is 1.5"),
         ({"seed": 2**64}, "seed is 18446744073709551616"),
         ({"device": "gpu"}, "device is 'gpu'.*cannot be used here"),
         ({"device": "cuda:99"}, "device is 'cuda:99'.*cannot be used here"),
         ({"history": 0}, "history is 0"),
+        ({"rotation": 4}, "rotation is 4; give a SceneRotation"),
+        ({"goal_reward": float("nan")}, "goal_reward is nan; give a finite number"),
+        ({"step_reward": None}, "step_reward is None; give a finite number"),
+        ({"collision_reward": "1"}, "collision_reward is '1'; give a finite number"),
     ],
 )
 def test_arguments(scenes: SceneSet, arguments: dict[str, Any], message: str) -> None:
     with pytest.raises(ConfigError, match=message):
         TargetNavEnv(**{"scenes": scenes, "goals": [3], **arguments})
+
+
+@pytest.mark.parametrize("device", ["mps", "xla", "hpu", "meta", "cuda:99", 5.5, "x" * 500])
+def test_a_device_that_is_not_there_is_one_short_line(scenes: SceneSet, device: Any) -> None:
+    with pytest.raises(ConfigError, match="which cannot be used here") as error:
+        TargetNavEnv(scenes, [3], device=device)
+    assert len(str(error.value)) < 400
+    assert "\n" not in str(error.value)
+
+
+def test_numbers_of_other_libraries_are_numbers(scenes: SceneSet) -> None:
+    env = TargetNavEnv(scenes, [3], torch.Size([2]), history=np.int64(2), max_steps=np.int32(3))
+    assert env.reset()["state_id"].shape == (2, 2)
+    assert TargetNavEnv(scenes, [3], (np.int64(3),)).batch_size == (3,)
+
+
+@pytest.mark.parametrize(
+    ("state", "message"),
+    [
+        (torch.zeros(3).long(), r"state is tensor\(\[0, 0, 0\]\); give whole numbers, one"),
+        (2.5, "state is 2.5; give whole numbers"),
+        ("2", "state is '2'; give whole numbers"),
+        (True, "state is True; give whole numbers"),
+        (10**6, "state 1000000 is out of range; the ids are 0..27"),
+    ],
+)
+def test_states_to_begin_at(scenes: SceneSet, state: Any, message: str) -> None:
+    with pytest.raises(GoalError, match=message):
+        TargetNavEnv(scenes, [3], [2]).set_state(state, 3)
+
+
+@pytest.mark.parametrize("ids", [torch.zeros(2, 4), torch.zeros(2, 3).long(), torch.zeros(2).long()])
+def test_states_to_resume_at(scenes: SceneSet, ids: torch.Tensor) -> None:
+    env = TargetNavEnv(scenes, [3], [2])
+    stands = TensorDict({"state_id": ids, "goal_id": torch.tensor([3, 3])}, [2])
+    with pytest.raises(GoalError, match=r"state_id is torch\.\w+ \[.*\]; give int64 \[2, 4\]"):
+        env.reset(stands, set_state=True)
+
+
+def test_a_rollout_of_no_steps(scenes: SceneSet) -> None:
+    for steps in (0, -1, 2.5):
+        with pytest.raises(ConfigError, match="max_steps is"):
+            TargetNavEnv(scenes, [3]).rollout(steps)
+
+
+def test_observations_of_other_scenes(scenes: SceneSet, make_scene: Callable[..., Scene]) -> None:
+    """The attic's ids exist in the hall, too."""
+    env = TargetNavEnv(SceneSet([make_scene("attic", 3, 1)]), [3])
+    with pytest.raises(
+        ConfigError, match=r"SceneObservation has scenes \['hall', 'attic'\], the environment"
+    ):
+        TransformedEnv(env, SceneObservation(scenes)).reset()
+    with pytest.raises(ConfigError, match=r"scenes is \['hall'\]; give a SceneSet"):
+        SceneObservation(["hall"])
+    again = SceneSet([make_scene("hall"), make_scene("attic", 3, 1)])
+    assert (
+        TransformedEnv(TargetNavEnv(scenes, [3]), SceneObservation(again)).rollout(2)["observation"].ndim == 3
+    )
 
 
 def test_a_bad_seed_changes_nothing(scenes: SceneSet) -> None:

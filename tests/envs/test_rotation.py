@@ -49,6 +49,7 @@ def test_weights_are_numbers_of_stays(six: SceneSet) -> None:
     ("given", "words"),
     [
         ({"active": 0}, "env.active_scenes is 0"),
+        ({"active": 7}, "env.active_scenes is 7 of 6 scenes; give fewer, or null for all of them"),
         ({"active": 3, "stay": 2}, "at least as many frames as scenes"),
         ({"active": 1, "weights": {"attic": 1.0}}, "there is no scene 'attic'"),
         ({"active": 1, "weights": {"room 1": -1.0}}, "'room 1' has -1.0"),

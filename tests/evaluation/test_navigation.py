@@ -10,7 +10,7 @@ from torchrl.envs.utils import ExplorationType, exploration_type
 from vusfa.envs import TargetNavEnv
 from vusfa.errors import ConfigError, GoalError
 from vusfa.evaluation import episode_starts, evaluate, random_walk, walk
-from vusfa.modules import make_agent
+from vusfa.modules import InferencePolicy, make_agent
 from vusfa.scenes import SceneSet
 
 
@@ -181,10 +181,42 @@ def test_a_world_of_unreachable_goals_is_refused(island: SceneSet, policies):
     [
         ("episodes_per_goal", 0, "episodes_per_goal is 0"),
         ("max_steps", 0, "max_steps is 0"),
-        ("batch_size", 0, "batch_size 0"),
+        ("batch_size", 0, "batch_size is 0"),
+        ("history", 0, "history is 0"),
+        ("seed", -1, "seed is -1; give a whole number of 0 or more"),
+        ("episodes_per_goal", 10**12, "episodes_per_goal is 1000000000000 for 1 goals; give at most"),
+        ("episodes", (torch.tensor([3]), torch.tensor([10**6])), "goal 1000000 is out of range"),
+        ("episodes", (torch.tensor([-1]), torch.tensor([3])), "start -1 is out of range"),
+        (
+            "episodes",
+            (torch.tensor([3, 4]), torch.tensor([5])),
+            r"int64 \[2\] and torch.int64 \[1\]; give starts",
+        ),
+        (
+            "episodes",
+            (torch.tensor([3.0]), torch.tensor([5])),
+            r"torch.float32 \[1\] and .*; give starts and goals",
+        ),
+        ("episodes", (torch.tensor([3]), torch.tensor([20])), "start 3 and goal 20 are in different scenes"),
         ("unreachable", "drop", "unreachable is 'drop'"),
     ],
 )
 def test_bad_settings(rooms: SceneSet, policies, setting: str, value, words: str):
-    with pytest.raises(ConfigError, match=words):
+    with pytest.raises((ConfigError, GoalError), match=words):
         evaluate(policies["turner"](0), rooms, [3], **{setting: value})
+
+
+def test_what_is_no_policy(rooms: SceneSet):
+    agent = make_agent("gvf", scenes=rooms, hidden_size=8, embedding_size=8)
+    with pytest.raises(
+        ConfigError, match=r"policy is 'Agent'; give a policy, such as InferencePolicy\(agent\)"
+    ):
+        evaluate(agent, rooms, [3])
+
+
+def test_fewer_frames_than_the_agent_reads(rooms: SceneSet):
+    """With constant weights a single frame stood for four."""
+    agent = make_agent("gvf", scenes=rooms, history=4, hidden_size=8, embedding_size=8)
+    for policy in (InferencePolicy(agent), agent.get_policy_operator()):
+        with pytest.raises(ConfigError, match="state_id has 1 frames a row and the agent reads 4"):
+            evaluate(policy, rooms, [3], history=1)

@@ -54,9 +54,9 @@ is read is resumed and trained on.
 
 - *Pictures of a scene.* Opening a scene decodes one. `check` and `fetch` of `vusfa scenes` first
   look at the header and the end of every picture, so that one that is cut off, of another size or no
-  picture is found in seconds, wherever it lies. Then `check` decodes all of them: it is asked for
-  everything, and in a large room takes longer than 10 seconds to find damage in the middle of a picture.
-  `fetch` decodes 500, evenly spaced, for the archive's checksums have told of damage on the way.
+  picture is found in seconds, wherever it lies. Then they decode as many, evenly spaced, as a few seconds
+  suffice for: all in a room of common size. Where that is not all, `check` says how many, and
+  `check --all` decodes every one, however long it takes.
 - *Features* are read, checked and written some rows at a time and take the memory of float32. Where that
   is more than 768 MiB beyond the file's size (float16, compressed), the scene is refused; stored as
   float32 it is read.

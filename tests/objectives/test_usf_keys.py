@@ -97,6 +97,11 @@ class TestKeys:
         keys = loss.value_estimator.tensor_keys
         assert {name: getattr(keys, name) for name in names} == names
 
+    @pytest.mark.parametrize("value_type", [5, 0.95, True, ["gae"], int])
+    def test_what_is_no_estimator_is_named(self, usf, value_type) -> None:
+        with pytest.raises(TypeError, match=r"USFLoss: value_type is .*; give a name such as 'gae', one of"):
+            USFLoss(usf().actor, usf().critic).make_value_estimator(value_type)
+
     @MODES
     def test_every_key_renamed_gives_the_same_loss(self, usf, rollout, functional: bool) -> None:
         networks = usf()

@@ -10,6 +10,7 @@ import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
@@ -160,6 +161,13 @@ def test_faults_of_scenes_in_memory_name_the_scene(changes: dict, words: str) ->
     arguments = {"graph": RING, "features": torch.rand(3, 1, 4), **changes}
     with pytest.raises(SceneError, match=r"scene 'ring': (.|\n)*" + words):
         Scene("ring", **arguments)
+
+
+@pytest.mark.parametrize("name", ["", 5, None, "a\x1b[2J", "x" * 201, "two\nlines"])
+def test_names_that_a_file_could_not_have(name: Any) -> None:
+    with pytest.raises(SceneError, match=r"attribute 'scene' is .*; give a name of 1 to 200") as error:
+        Scene(name, RING, torch.rand(3, 1, 4))
+    assert len(str(error.value)) < 600
 
 
 def test_pictures_in_any_order_shape_and_number(make_file: Callable[..., Path], pictures: np.ndarray) -> None:

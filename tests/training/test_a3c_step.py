@@ -102,7 +102,9 @@ def test_a_number_that_does_not_divide_is_refused(scene_file: Path) -> None:
 
 
 def test_hindsight_has_no_threads(scene_file: Path) -> None:
-    with pytest.raises(ConfigError, match=r"a3c_rmsprop makes an update per environment .* optim=adam"):
+    with pytest.raises(
+        ConfigError, match=r"algorithm=hindsight .*a3c_rmsprop makes an update per environment .* optim=adam"
+    ):
         made(scene_file, "algorithm=hindsight", "agent.history=1")
 
 

@@ -127,6 +127,11 @@ def test_rows_are_shared_out_evenly():
         rows_per_worker("multi_sync", 7, 3)
     with pytest.raises(ConfigError, match="both must be 1 or more"):
         rows_per_worker("single", 0, 1)
+    for num_envs, rollout in ((10**13, 1), (2, 10**12), (10**5, 10**5)):
+        with pytest.raises(
+            ConfigError, match=r"collector\.rollout \d+; a batch has at most 268,435,456 frames"
+        ):
+            rows_per_worker("single", num_envs, 1, rollout)
 
 
 def test_bad_settings_show_before_a_process_starts(rooms: SceneSet, agent: Agent):

@@ -126,6 +126,9 @@ NAN = torch.full((8,), torch.nan)
         ("goals", torch.zeros(3), "not a list of state ids"),
         ("config/seed", None, "not of type int"),
         ("run_id", b"a", "a bytes, which no checkpoint holds"),
+        ("run_id", "../../x", "no id of a run"),
+        ("run_id", "a\x1b[2J", "no id of a run"),
+        ("run_id", "x" * 129, "no id of a run"),
     ],
 )
 def test_what_is_wrong_is_named(changed, name: str, value: Any, words: str):

@@ -85,7 +85,11 @@ def test_entropy_and_rate_follow_the_frames(scene_file: Path, extra: list[str]):
 @pytest.mark.parametrize(
     ("overrides", "words"),
     [
-        (["agent.memory=lstm"], "has no memory"),
+        (
+            ["agent.memory=lstm"],
+            "algorithm=hindsight cannot train an agent with agent.memory=lstm; give agent.m",
+        ),
+        (["agent.observation=features"], "agent.observation=features; give agent.observation=index, or"),
         (["collector=multi_async"], "no fixed order"),
         (["hindsight.temperature=0"], "hindsight: "),
         (["hindsight.updates=0"], "hindsight.updates is 0; give 1 or more, or algorithm=usf"),

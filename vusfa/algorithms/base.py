@@ -17,10 +17,11 @@ from torch import Tensor, nn
 
 from vusfa.algorithms.schedule import threads_per_step
 from vusfa.envs.observation import crop_index
+from vusfa.errors import ConfigError
 from vusfa.modules import Agent, FeatureFrames
 from vusfa.scenes import SceneSet
 
-__all__ = ["Algorithm", "AlgorithmSettings"]
+__all__ = ["Algorithm", "AlgorithmSettings", "check_replay"]
 
 
 @dataclass
@@ -132,3 +133,29 @@ class Algorithm:
     def warm_start(self, state: Mapping[str, Any]) -> None:
         """Take from a ``state_dict`` what belongs to the agent's weights, such as a multiplier, and nothing
         that belongs to the run, such as a replay buffer: for fine-tuning."""
+
+
+def check_replay(algorithm: str, agent: Agent, threads: int | None, **required: Any) -> None:
+    """Refuse an agent or an optimizer that cannot learn from replay, where goals are given by their ids.
+
+    Args:
+        algorithm: its registered name.
+        agent: what learns.
+        threads: of the optimizer, see :func:`~vusfa.algorithms.threads_per_step`.
+        **required: values of the agent's configuration that the algorithm needs besides.
+
+    Raises:
+        ConfigError: naming the setting.
+    """
+    for name, value in {"observation": "index", "memory": None, **required}.items():
+        given, wanted = (str(each).replace("None", "null") for each in (agent.config[name], value))
+        if given != wanted:
+            raise ConfigError(
+                f"algorithm={algorithm} cannot train an agent with agent.{name}={given}; give"
+                f" agent.{name}={wanted}, or algorithm=usf"
+            )
+    if threads is not None:
+        raise ConfigError(
+            f"algorithm={algorithm} takes steps from replay, and optim.kind=a3c_rmsprop makes an update per"
+            " environment of a batch; give optim=adam, or algorithm=usf"
+        )

@@ -8,6 +8,7 @@ from typing import Any
 from tensordict import TensorDictBase
 from torch import Tensor
 
+from vusfa.algorithms.base import check_replay
 from vusfa.algorithms.registry import register_algorithm
 from vusfa.algorithms.replay import HindsightReplay, merge_replays, share_of_replay
 from vusfa.algorithms.usf import USF
@@ -37,20 +38,11 @@ class Hindsight(USF):
         updates = numbers["updates"]
         if updates < 1:
             raise ConfigError(f"hindsight.updates is {updates}; give 1 or more, or algorithm=usf")
-        if agent.config["observation"] != "index" or agent.config["memory"] is not None:
-            raise ConfigError(
-                "hindsight names goals by their ids, to an agent that reads ids and has no memory; give"
-                " agent.observation=index and agent.memory=null, or algorithm=usf"
-            )
+        check_replay("hindsight", agent, self.threads)
         if collector["kind"] == "multi_async":
             raise ConfigError(
                 "hindsight follows each environment from batch to batch, which collector.kind=multi_async"
                 " hands over in no fixed order; give single or multi_sync, or algorithm=usf"
-            )
-        if self.threads is not None:
-            raise ConfigError(
-                "optim.kind=a3c_rmsprop makes an update per environment of a batch, and steps from"
-                " hindsight's replay have none; give optim=adam, or algorithm=usf"
             )
         self.replay_steps = updates - 1
         sizes = {name: numbers[name] for name in _OF_REPLAY}

@@ -9,7 +9,7 @@ from typing import Any
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from vusfa.algorithms.base import AlgorithmSettings
+from vusfa.algorithms.base import AlgorithmSettings, check_replay
 from vusfa.algorithms.experience import ExperienceGraph, merge_graphs
 from vusfa.algorithms.registry import register_algorithm
 from vusfa.algorithms.usf import USF
@@ -80,17 +80,7 @@ class ReplaySearch(USF):
                 f"algorithm.learning_starts is {starts} of total_frames {total}: nothing would be learned"
                 " from the search; give fewer, 0 or more, or null"
             )
-        if agent.config["observation"] != "index" or agent.config["memory"] or agent.config["history"] != 1:
-            raise ConfigError(
-                "replay_search makes pairs of a state and a goal by their ids, for an agent that reads one id"
-                " and has no memory; give agent.observation=index, agent.memory=null and agent.history=1, or"
-                " algorithm=usf"
-            )
-        if self.threads is not None:
-            raise ConfigError(
-                "optim.kind=a3c_rmsprop makes an update per environment of a batch, and pairs of states and"
-                " goals have none; give optim=adam, or algorithm=usf"
-            )
+        check_replay("replay_search", agent, self.threads, history=1)
         self._searches = False
         self.graph = ExperienceGraph(scenes.num_states, scenes.num_actions)
         rewards = {name: settings["env"][name] for name in ("goal_reward", "step_reward")}

@@ -33,7 +33,14 @@ import vusfa.algorithms  # noqa: F401  (registers those of this package)
 from vusfa.cli.resume import resumed_settings
 from vusfa.conf import FOLDER
 from vusfa.conf import compose as conf_compose
-from vusfa.conf.schema import check_overrides, mistake, register_schema, unknown_setting, validated
+from vusfa.conf.schema import (
+    check_overrides,
+    mistake,
+    register_schema,
+    unknown_setting,
+    validated,
+    wrong_value,
+)
 from vusfa.errors import RankError, ResultError, VusfaError, WorkerError, near
 from vusfa.files import say, use_own_temporary_folder
 from vusfa.modules.config import resolve_config
@@ -63,7 +70,7 @@ def launch(job: Job, folder: Path = FOLDER, name: str = "train") -> None:
     if "RL_LOGGING_LEVEL" not in os.environ:  # enables TorchRL's log
         logging.getLogger("torchrl").setLevel(logging.WARNING)
     use_own_temporary_folder()
-    sys.argv[1:] = [_quoted(argument) for argument in sys.argv[1:]]
+    sys.argv[1:] = [conf_compose.appended(_quoted(argument)) for argument in sys.argv[1:]]
     codes: list[int] = []
 
     def guarded(cfg: DictConfig) -> None:
@@ -116,14 +123,15 @@ def explain(error: Exception, folder: Path) -> str:
     if isinstance(error, MissingConfigException) and "Available options" in str(error):
         group, _, choice = (error.missing_cfg_file or "").rpartition("/")
         options = sorted(option.strip() for option in error.options or ())
-        return f"{group}={choice}: there is no such choice; {near(choice, options)}"
+        return f"{group}={choice[:100]}: there is no such choice; {near(choice, options)}"
     GlobalHydra.instance().clear()
     unknown = re.match(r"Could not override '([^']+)'", text)
     if unknown:
         groups = [entry.name for entry in folder.iterdir() if entry.is_dir()]
         names = [*conf_compose.default_settings(), *groups, "algorithm"]
         return unknown_setting(unknown[1], names)
-    return mistake(error) or text
+    merging = re.match(r"Error merging override \+*([\w.]+)=(.*)", text)
+    return mistake(error) or (wrong_value(merging[1], merging[2]) if merging else text)
 
 
 def _settled(cfg: DictConfig, overrides: Sequence[str]) -> dict[str, Any]:

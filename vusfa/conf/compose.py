@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from functools import cache
 from pathlib import Path
@@ -14,7 +15,16 @@ from omegaconf import DictConfig, OmegaConf
 from vusfa.conf import FOLDER
 from vusfa.conf.settings import flat
 
-__all__ = ["compose", "default_settings"]
+__all__ = ["appended", "compose", "default_settings"]
+
+
+def appended(override: str) -> str:
+    """An override as Hydra wants it, which takes new keys of a mapping only as an addition.
+
+    >>> appended("env.scene_weights={hall: 2}"), appended("seed=1")
+    ('++env.scene_weights={hall: 2}', 'seed=1')
+    """
+    return f"++{override}" if re.match(r"(env\.scene_weights|optim\.options)[.=]", override) else override
 
 
 def compose(folder: Path = FOLDER, name: str = "train", overrides: Sequence[str] = ()) -> DictConfig:
@@ -25,6 +35,7 @@ def compose(folder: Path = FOLDER, name: str = "train", overrides: Sequence[str]
         name: name of the primary file.
         overrides: words of the command line.
     """
+    overrides = [appended(override) for override in overrides]
     if GlobalHydra.instance().is_initialized():  # within a job
         return hydra.compose(name, list(overrides))
     with hydra.initialize_config_dir(str(folder.resolve()), version_base="1.3"):

@@ -5,6 +5,7 @@ Needs Hydra (extra ``recipes``).
 
 from __future__ import annotations
 
+import math
 import types
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import fields, is_dataclass
@@ -16,11 +17,19 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import ConfigKeyError, OmegaConfBaseException, ValidationError
 
 from vusfa.conf.compose import default_settings
-from vusfa.conf.settings import ALGORITHMS, LOSS_TERMS, POSITIVE, ObjectiveSettings, Settings, flat
+from vusfa.conf.settings import ALGORITHMS, LARGEST, LOSS_TERMS, POSITIVE, ObjectiveSettings, Settings, flat
 from vusfa.errors import ConfigError, near
 from vusfa.limits import brief
 
-__all__ = ["check_overrides", "mistake", "register_schema", "schema", "unknown_setting", "validated"]
+__all__ = [
+    "check_overrides",
+    "mistake",
+    "register_schema",
+    "schema",
+    "unknown_setting",
+    "validated",
+    "wrong_value",
+]
 
 _WORDS = {bool: "true or false", int: "a whole number", float: "a number", str: "text"}
 _EXAMPLES = {"scenes": "[bathroom, kitchen]"}
@@ -64,7 +73,7 @@ def check_overrides(overrides: Sequence[str]) -> None:
             continue
         value = override.value()
         if not isinstance(value, bool) and not (optional and value is None) and "${" not in str(value):
-            raise ConfigError(_wrong_value(override.key_or_group, value))
+            raise ConfigError(wrong_value(override.key_or_group, value))
 
 
 def validated(settings: Mapping[str, Any], where: str = "") -> dict[str, Any]:
@@ -88,7 +97,7 @@ def validated(settings: Mapping[str, Any], where: str = "") -> dict[str, Any]:
         name = plain.get("algorithm", {}).get("name") if isinstance(plain.get("algorithm"), dict) else None
         if name not in ALGORITHMS:
             raise ConfigError(
-                f"algorithm.name is {name!r}: no such algorithm is registered; {near(name, ALGORITHMS)}"
+                f"algorithm.name is {brief(name)}: no such algorithm is registered; {near(name, ALGORITHMS)}"
             )
         known.algorithm = OmegaConf.structured(ALGORITHMS[name])
         merged = OmegaConf.merge(known, plain)
@@ -99,7 +108,7 @@ def validated(settings: Mapping[str, Any], where: str = "") -> dict[str, Any]:
         _check_ranges(result)
         return result
     except OmegaConfBaseException as error:
-        raise ConfigError(f"{where}{mistake(error)}") from error
+        raise ConfigError(f"{where}{mistake(error) or brief(str(error))}") from error
     except ConfigError as error:
         raise ConfigError(f"{where}{error}") from error
 
@@ -111,7 +120,7 @@ def mistake(error: BaseException) -> str | None:
         if isinstance(error, ConfigKeyError) or type(error).__name__ == "ConfigAttributeError":
             return unknown_setting(str(key))
         if isinstance(error, ValidationError) and key:
-            return _wrong_value(key, error.value)
+            return wrong_value(key, error.value)
         if type(error).__name__ == "ConfigTypeError" and "deletion" in str(error):
             return f"{key} is missing; it may be {_example(str(key))}"
         if error.__cause__ is None:
@@ -151,12 +160,17 @@ def _check_ranges(settings: Mapping[str, Any]) -> None:
         raise ConfigError(f"scenes is {_shown(scenes)}; it must be a list, such as {_example('scenes')}")
     if not all(isinstance(scene, str) for scene in scenes):
         raise ConfigError(f"scenes is {_shown(scenes)}; each entry must be as in {_example('scenes')}")
+    every = flat(settings)
     for name in POSITIVE:
-        value: Any = settings
-        for part in name.split("."):
-            value = value[part]
+        value = every[name]
         if value is not None and value <= 0:
             raise ConfigError(f"{name} is {value}; it must be more than 0")
+    for name, value in every.items():
+        if isinstance(value, float) and not math.isfinite(value):
+            raise ConfigError(f"{name} is {value}; it must be a finite number")
+    for name, most in LARGEST.items():
+        if (every.get(name) or 0) > most:
+            raise ConfigError(f"{name} is {brief(every[name])}; it must be at most {most:,}")
     if (settings["early_stopping"]["success"] or 0) > 1:
         share = settings["early_stopping"]["success"]
         raise ConfigError(
@@ -177,6 +191,11 @@ def _type_of(name: str) -> tuple[Any, bool]:
     kind, optional = Settings, False
     for part in name.split("."):
         hints = get_type_hints(kind) if is_dataclass(kind) else {}
+        if name.startswith("algorithm.") and part != "algorithm":
+            kinds = [one if isinstance(one, type) else type(one) for one in ALGORITHMS.values()]
+            hints = {key: hint for one in kinds for key, hint in get_type_hints(one).items()}
+        if get_origin(kind) is dict:
+            hints = {part: get_args(kind)[1]}
         if part not in hints:
             return Any, True
         kind, optional = hints[part], False
@@ -186,7 +205,12 @@ def _type_of(name: str) -> tuple[Any, bool]:
     return kind, optional
 
 
-def _wrong_value(name: str, value: Any) -> str:
+def wrong_value(name: str, value: Any) -> str:
+    """Message for a value of another type.
+
+    >>> wrong_value("seed", "{a: 1}")
+    "seed is '{a: 1}'; it must be a whole number, such as 0"
+    """
     kind, optional = _type_of(name)
     if is_dataclass(kind) or get_origin(kind) is dict:
         inner = [key for key in _names() if key.startswith(f"{name}.")] or [f"{name}.NAME"]
@@ -210,5 +234,5 @@ def _example(name: str) -> str:
 def _shown(value: Any) -> str:
     """A value as written on a command line."""
     if isinstance(value, list):
-        return f"[{', '.join(map(str, value))}]"
-    return "null" if value is None else repr(value)
+        return f"[{', '.join(map(str, value[:10]))}{', ...' if len(value) > 10 else ''}]"
+    return "null" if value is None else brief(value)

@@ -12,6 +12,7 @@ from typing import Any
 
 __all__ = [
     "ALGORITHMS",
+    "LARGEST",
     "LOSS_TERMS",
     "MAX_STEPS",
     "POSITIVE",
@@ -46,6 +47,14 @@ POSITIVE = (
     "collector.timeout",
     *(f"early_stopping.{name}" for name in ("success", "every", "episodes_per_goal", "max_steps")),
 )
+#: Largest value of settings by which threads and processes begin, or memory is taken at once.
+LARGEST = {
+    "threads": 1024,
+    "collector.num_workers": 1024,
+    "hindsight.capacity": 1 << 28,
+    "hindsight.batch_size": 1 << 24,
+    "algorithm.batch_size": 1 << 24,
+}
 
 
 @dataclass

@@ -16,8 +16,9 @@ from vusfa.deploy.agents import open_agent
 from vusfa.deploy.backbone import find_backbone
 from vusfa.deploy.pictures import as_picture, in_shape
 from vusfa.deploy.places import Places
+from vusfa.envs.scene_env import check_seed
 from vusfa.errors import ConfigError, GoalError
-from vusfa.limits import listing
+from vusfa.limits import brief, listing
 from vusfa.modules import Agent
 from vusfa.scenes import SceneSet
 from vusfa.sources.backbones import Backbone
@@ -96,8 +97,11 @@ class Navigator:
         with torch.no_grad():
             table = self.scenes.features[:, 0] if self.backbone else frames.lookup(None).cpu()
         self.places = Places(table, self.scenes.offsets.diff().tolist())
-        if threshold is not None and not -1 <= threshold <= 1:
-            raise ConfigError(f"threshold is {threshold}; a similarity is between -1 and 1, such as 0.8")
+        check_seed(seed)
+        if threshold is not None and not (isinstance(threshold, int | float) and -1 <= threshold <= 1):
+            raise ConfigError(
+                f"threshold is {brief(threshold)}; a similarity is between -1 and 1, such as 0.8"
+            )
         self.threshold = self.places.arrived if threshold is None else threshold
         self.scene = None if scene is None else self.scenes.names[self.scenes.scene_index(scene)]
         self.probabilities: Tensor | None = None
@@ -257,8 +261,13 @@ def reading_pictures(agent: Agent, scenes: SceneSet) -> Agent:
 
     Args:
         agent: the trained agent.
-        scenes: those that it was trained in.
+        scenes: those that it was trained in; for an agent whose heads are the same for all rooms also others
+            with as many actions and features.
+
+    Raises:
+        ConfigError: the agent was made for other scenes.
     """
+    agent.home._replace(reads_ids=False).check(scenes)
     kind = "pixels" if agent.config["encoder"] == "conv" else "features"
     config = {**agent.config, "observation": kind, "pretrained": None}
     reading = rebuild_agent(config, scenes)

@@ -8,13 +8,16 @@ released code of VUSFA.)
 
 from __future__ import annotations
 
+import math
+from numbers import Real
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
 from vusfa.conf.settings import MAX_STEPS
-from vusfa.errors import ActionError
+from vusfa.errors import ActionError, ConfigError
+from vusfa.limits import brief
 
 __all__ = [
     "GOAL_REWARD",
@@ -54,10 +57,12 @@ class Rewards(NamedTuple):
         cls, goal: float = GOAL_REWARD, step: float = STEP_REWARD, collision: float | None = None
     ) -> Rewards:
         """From numbers; ``collision=None``: a collision earns what any step earns."""
-        as_tensor = [
-            None if x is None else torch.tensor(x, dtype=torch.float32) for x in (goal, step, collision)
-        ]
-        return cls(*as_tensor)  # type: ignore[arg-type]
+        given = {"goal": goal, "step": step} | ({} if collision is None else {"collision": collision})
+        for name, value in given.items():
+            if isinstance(value, bool) or not isinstance(value, Real) or not math.isfinite(value):
+                raise ConfigError(f"{name}_reward is {brief(value)}; give a finite number")
+        tensors = {name: torch.tensor(float(value), dtype=torch.float32) for name, value in given.items()}
+        return cls(tensors["goal"], tensors["step"], tensors.get("collision"))
 
 
 class Transition(NamedTuple):

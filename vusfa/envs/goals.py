@@ -239,3 +239,41 @@ def _random(scenes: SceneSet, text: str) -> Tensor:
         chosen = generator.choice(len(candidates), count, replace=False)
         found.append(candidates[np.sort(chosen)] + first)
     return torch.cat(found)
+
+
+def as_ids(name: str, value: Any, shape: Sequence[int], device: torch.device | None = None) -> Tensor:
+    """Global ids as given to an environment, (*B,) int64: one for all rows, or one per row.
+
+    Raises:
+        GoalError: no whole numbers, or of another shape.
+
+    >>> as_ids("goal", 3, [2])
+    tensor([3, 3])
+    """
+    try:
+        ids = torch.as_tensor(value, device=device)
+        if not ids.is_floating_point() and ids.dtype != torch.bool:
+            return ids.to(torch.int64).expand(torch.Size(shape))
+    except (RuntimeError, TypeError, ValueError):
+        pass
+    raise GoalError(
+        f"{name} is {brief(value)}; give whole numbers, one for all rows or of shape {list(shape)}"
+    )
+
+
+def check_ids(name: str, ids: Tensor, shape: Sequence[int], num_states: int) -> None:
+    """Check ids of states that a tensordict holds.
+
+    Raises:
+        GoalError: another type or shape, or out of range.
+
+    >>> check_ids("goal", torch.tensor([3, 9]), [2], num_states=9)
+    Traceback (most recent call last):
+    ...
+    vusfa.errors.GoalError: goal 9 is out of range; the ids are 0..8
+    """
+    if ids.dtype != torch.int64 or tuple(ids.shape) != tuple(shape):
+        raise GoalError(f"{name}_id is {ids.dtype} {list(ids.shape)}; give int64 {list(shape)}")
+    wrong = ids[(ids < 0) | (ids >= num_states)]
+    if wrong.numel():
+        raise GoalError(f"{name} {int(wrong[0])} is out of range; the ids are 0..{num_states - 1}")

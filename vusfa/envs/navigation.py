@@ -14,9 +14,9 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from vusfa.envs import dynamics
-from vusfa.envs.goals import GoalSpec, resolve_goals
+from vusfa.envs.goals import GoalSpec, as_ids, check_ids, resolve_goals
 from vusfa.envs.rotation import Rotation, SceneRotation
-from vusfa.envs.scene_env import SceneEnv, check_least, usable_device
+from vusfa.envs.scene_env import SceneEnv, check_counts, usable_device
 from vusfa.envs.starts import DRAW_LIMIT, GoalTable, draw_goals, draw_starts, paths_from
 from vusfa.envs.world import RotatingWorld, make_world
 from vusfa.errors import ConfigError, GoalError
@@ -116,7 +116,7 @@ class TargetNavEnv(SceneEnv):
         first_frame: int = 0,
         frames_per_step: int | None = None,
     ) -> None:
-        check_least(history=(history, 1), max_steps=(max_steps, 1), first_goal=(first_goal, 0))
+        check_counts(history=(history, 1), max_steps=(max_steps, 1), first_goal=(first_goal, 0))
         if goal_sampling not in ("fixed", "episode"):
             raise ConfigError(f"goal_sampling is {goal_sampling!r}; it is 'fixed' or 'episode'")
         super().__init__(scenes, batch_size, history, seed)
@@ -257,8 +257,7 @@ class TargetNavEnv(SceneEnv):
                 its state.
         """
         state, goal = (
-            torch.as_tensor(x, dtype=torch.int64, device=self.device).expand(self.batch_size)
-            for x in (state, goal)
+            as_ids(n, x, self.batch_size, self.device) for n, x in (("state", state), ("goal", goal))
         )
         entries = {"state_id": dynamics.start_history(state, self.history), "goal_id": goal.clone()}
         return self.reset(TensorDict(entries, batch_size=self.batch_size, device=self.device), set_state=True)
@@ -270,12 +269,8 @@ class TargetNavEnv(SceneEnv):
         if goal_id is None:
             raise ConfigError("reset() was given a 'state_id' to resume at and no 'goal_id'; give both")
         scenes = self.scenes
-        for name, ids in (("state", state_id), ("goal", goal_id)):
-            wrong = ids[(ids < 0) | (ids >= scenes.num_states)]
-            if wrong.numel():
-                raise GoalError(
-                    f"{name} {int(wrong[0])} is out of range; the ids are 0..{scenes.num_states - 1}"
-                )
+        for name, ids, shape in (("state", state_id, (self.history,)), ("goal", goal_id, ())):
+            check_ids(name, ids, (*self.batch_size, *shape), scenes.num_states)
         state = state_id[..., -1]
         elapsed = tensordict.get("elapsed_steps", self._zeros(torch.int64)).squeeze(-1)
         over = (elapsed > 0) & ((state == goal_id) | (elapsed >= self.max_steps))

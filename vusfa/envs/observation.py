@@ -18,7 +18,7 @@ from torchrl.envs import ObservationTransform, TransformedEnv
 from vusfa.envs.navigation import TargetNavEnv
 from vusfa.errors import ConfigError, SceneError
 from vusfa.limits import brief
-from vusfa.scenes import Scene, SceneSet
+from vusfa.scenes import Scene, SceneSet, check_scenes
 from vusfa.scenes.features import SceneRows
 
 __all__ = ["SceneObservation", "crop_index", "observation_table"]
@@ -129,6 +129,7 @@ class SceneObservation(ObservationTransform):
         out_keys: Sequence[NestedKey] = ("observation", "goal_observation"),
     ) -> None:
         super().__init__(in_keys=list(in_keys), out_keys=list(out_keys))
+        check_scenes(scenes)
         if kind not in ("features", "pixels"):
             raise ConfigError(f"kind is {kind!r}; it is 'features' or 'pixels'")
         crops = scenes.num_crops if kind == "features" else 1
@@ -157,6 +158,7 @@ class SceneObservation(ObservationTransform):
             return found.reshape(*obs.shape, *found.shape[1:])
         table = self._table
         if table is None or table.device != obs.device:
+            self._check_env()
             table = observation_table(self.scenes, self.kind, self.size).to(obs.device)
             if self.crop is not None:
                 table = table[:, self.crop : self.crop + 1].contiguous()
@@ -179,11 +181,25 @@ class SceneObservation(ObservationTransform):
         shape = (obs.numel(),)
         return torch.randint(self.crops, shape, generator=self._generator(), device=obs.device)
 
-    def _generator(self) -> torch.Generator | None:
+    def _env(self) -> TargetNavEnv | None:
         env: Any = self.container
         while isinstance(env, TransformedEnv):
             env = env.base_env
-        return env.generator if isinstance(env, TargetNavEnv) else None
+        return env if isinstance(env, TargetNavEnv) else None
+
+    def _check_env(self) -> None:
+        """Raise a ConfigError where the ids of the environment are those of other scenes."""
+        env = self._env()
+        own, other = self.scenes, self.scenes if env is None else env.scenes
+        if own.scenes is not other.scenes and own.fingerprint != other.fingerprint:
+            raise ConfigError(
+                f"SceneObservation has scenes {brief(list(own.names))}, the environment"
+                f" {brief(list(other.names))}; give it those of the environment"
+            )
+
+    def _generator(self) -> torch.Generator | None:
+        env = self._env()
+        return None if env is None else env.generator
 
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
         return self._call(tensordict_reset)

@@ -64,7 +64,7 @@ class Rotation:
         goals: (G,) global ids.
 
     Raises:
-        ConfigError: weights of scenes that there are none of, or that leave no scene.
+        ConfigError: more active scenes than there are; weights of unknown scenes, or that leave no scene.
 
     >>> rooms = SceneSet.bundled()
     >>> rotation = Rotation(SceneRotation(active=2, stay=1000), rooms, torch.tensor([0, 176, 580, 1260]))
@@ -73,9 +73,16 @@ class Rotation:
     """
 
     def __init__(self, settings: SceneRotation, scenes: SceneSet, goals: Tensor) -> None:
+        if not isinstance(settings, SceneRotation):
+            raise ConfigError(f"rotation is {brief(settings)}; give a SceneRotation")
         unknown = sorted(settings.weights.keys() - set(scenes.names))
         if unknown:
             raise ConfigError(f"env.scene_weights: there is no scene {brief(unknown[0])}; name the set's own")
+        if settings.active > scenes.num_scenes:
+            raise ConfigError(
+                f"env.active_scenes is {settings.active} of {scenes.num_scenes} scenes; give fewer, or null"
+                " for all of them"
+            )
         self.settings = settings
         goals = goals.cpu()
         scene = scenes.scene_id.cpu()[goals]

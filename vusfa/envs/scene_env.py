@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Sequence
+import math
+from collections.abc import Callable, Iterable, Sequence
+from numbers import Integral
 from typing import Any, ClassVar
 
 import numpy as np
@@ -14,24 +16,42 @@ from torch import Tensor
 from vusfa.envs.rendering import draw_panels
 from vusfa.envs.world import RotatingWorld, World, env_specs, map_tensors
 from vusfa.errors import ConfigError
-from vusfa.limits import brief
-from vusfa.scenes import SceneSet
+from vusfa.limits import MAX_ENV_FRAMES, brief
+from vusfa.scenes import SceneSet, check_home, check_scenes
 from vusfa.torchrl_private import StatelessEnv
 
-__all__ = ["SceneEnv", "check_least", "usable_device"]
+__all__ = ["SceneEnv", "check_counts", "check_seed", "usable_device"]
 
 
-def check_least(**arguments: tuple[int, int]) -> None:
-    """Refuse arguments, each with its smallest value, that are smaller.
+def check_counts(**arguments: tuple[Any, int]) -> None:
+    """Refuse arguments, each with its smallest value, that are smaller, or no whole numbers.
 
-    >>> check_least(history=(0, 1))
+    >>> check_counts(history=(0, 1))
     Traceback (most recent call last):
     ...
     vusfa.errors.ConfigError: history is 0; it must be at least 1
     """
     for name, (value, least) in arguments.items():
+        if not _is_whole(value) or value >= 2**31:
+            raise ConfigError(f"{name} is {brief(value)}; give a whole number below 2 ** 31")
         if value < least:
             raise ConfigError(f"{name} is {value}; it must be at least {least}")
+
+
+def check_seed(seed: Any) -> None:
+    """Refuse what is no seed of a random generator.
+
+    >>> check_seed(-1)
+    Traceback (most recent call last):
+    ...
+    vusfa.errors.ConfigError: seed is -1; give a whole number of 0 or more, below 2 ** 63
+    """
+    if not (_is_whole(seed) and 0 <= seed < 2**63):
+        raise ConfigError(f"seed is {brief(seed)}; give a whole number of 0 or more, below 2 ** 63")
+
+
+def _is_whole(value: Any) -> bool:
+    return isinstance(value, Integral) and not isinstance(value, bool)
 
 
 def usable_device(device: torch.device | str) -> torch.device:
@@ -45,11 +65,12 @@ def usable_device(device: torch.device | str) -> torch.device:
     """
     try:
         found = torch.device(device)
-        torch.empty(0, device=found)
-    except (RuntimeError, AssertionError, NotImplementedError) as error:
-        first = str(error).splitlines()[0]
+        torch.empty(1, device=found).cpu()  # a meta device holds no numbers
+    except (RuntimeError, AssertionError, ImportError, TypeError) as error:
+        first = str(error).splitlines()[0].split(". ")[0]
+        first = first if len(first) < 100 else f"{first[:97]}..."
         raise ConfigError(
-            f"device is {str(device)!r}, which cannot be used here ({first}); give cpu or cuda"
+            f"device is {brief(str(device))}, which cannot be used here ({first}); give cpu or cuda"
         ) from error
     return found
 
@@ -76,18 +97,18 @@ class SceneEnv(StatelessEnv):
         cls.__signature__ = signature.replace(parameters=list(signature.parameters.values())[1:])
 
     def __init__(self, scenes: SceneSet, batch_size: Sequence[int], history: int, seed: int | None) -> None:
-        if not isinstance(scenes, SceneSet):
+        check_scenes(scenes)
+        if isinstance(batch_size, str) or not isinstance(batch_size, Iterable):
+            example = [batch_size] if _is_whole(batch_size) else [64]
+            raise ConfigError(f"batch_size is {brief(batch_size)}; give a list, {brief(example)}")
+        lengths = list(batch_size)
+        if not all(_is_whole(length) and length > 0 for length in lengths):
+            raise ConfigError(f"batch_size is {brief(lengths)}; give lengths of 1 or more, [64]")
+        if (most := MAX_ENV_FRAMES // history) < math.prod(lengths):
             raise ConfigError(
-                f"scenes is {brief(scenes)}; give a SceneSet, such as SceneSet.open(['bathroom'])"
+                f"batch_size is {brief(lengths)}; with history={history} give at most {most:,} environments"
             )
-        if isinstance(batch_size, int):
-            raise ConfigError(f"batch_size is {batch_size}; give a list, [{batch_size}]")
-        try:
-            size = torch.Size(batch_size)
-        except TypeError as error:
-            raise ConfigError(f"batch_size is {brief(batch_size)}; give a list, [64]") from error
-        if any(length < 1 for length in size):
-            raise ConfigError(f"batch_size is {brief(batch_size)}; give lengths of 1 or more, [64]")
+        size = torch.Size(lengths)
         super().__init__(device=torch.device("cpu"), batch_size=size)
         self.scenes = scenes.to("cpu")
         self.history = history
@@ -95,6 +116,12 @@ class SceneEnv(StatelessEnv):
         self._seed: int | None = None
         self._set_seed(seed)
         self._shown: tuple[Tensor, Tensor] | None = None
+
+    def rollout(self, max_steps: int, policy: Any = None, *args: Any, **options: Any) -> TensorDictBase:
+        """As :meth:`EnvBase.rollout`; an agent that was made for other scenes is a ``ConfigError``."""
+        check_counts(max_steps=(max_steps, 1))
+        check_home(policy, self.scenes)
+        return super().rollout(max_steps, policy, *args, **options)
 
     def _make_specs(self, shortest_path: bool) -> None:
         specs = env_specs(self.scenes, self.batch_size, self.history, shortest_path)
@@ -107,8 +134,8 @@ class SceneEnv(StatelessEnv):
 
     def _set_seed(self, seed: int | None) -> None:
         """Start the generator anew; None starts it somewhere else each time."""
-        if seed is not None and not (isinstance(seed, int | np.integer) and 0 <= seed < 2**63):
-            raise ConfigError(f"seed is {seed!r}; give a whole number of 0 or more, or None")
+        if seed is not None:
+            check_seed(seed)
         self._seed = None if seed is None else int(seed)
         if seed is None:
             self._generator.seed()

@@ -21,7 +21,7 @@ from torch import Tensor
 from vusfa.envs.dynamics import MAX_STEPS
 from vusfa.evaluation.episodes import Episodes
 from vusfa.evaluation.metrics import METRICS, metrics_within
-from vusfa.scenes import SceneSet
+from vusfa.scenes import SceneSet, check_home
 from vusfa.scenes.markov import arrival_by_step, goals_at_once
 
 __all__ = [
@@ -244,6 +244,7 @@ def _distributions(
     """Of a scene's goals, in blocks: ids (g,); the probability (g, K + 1, D) that an episode arrives with its
     k-th action and its shortest path has d; the mean shortest path (g,), NaN for a goal that no start
     reaches; the probability (g, N) of arriving within K actions from each state."""
+    check_home(getattr(probabilities, "__self__", None), scenes)  # of a TabularPolicy's method
     scene, first = scenes.scenes[index], int(scenes.offsets[index])
     size, longest = scene.num_states, scene.longest_path
     for block in goals.split(at_once or goals_at_once(size)) if len(goals) else ():

@@ -23,9 +23,9 @@ from vusfa.envs.dynamics import MAX_STEPS, Rewards, start_history, step
 from vusfa.envs.goals import resolve_goals
 from vusfa.errors import ConfigError
 from vusfa.evaluation.episodes import Episodes
-from vusfa.evaluation.starts import Unreachable, episode_starts
+from vusfa.evaluation.starts import Unreachable, check_evaluation, check_pairs, episode_starts
 from vusfa.modules import InferencePolicy
-from vusfa.scenes import SceneSet
+from vusfa.scenes import SceneSet, check_home
 
 __all__ = ["acting", "evaluate", "trails", "walk"]
 
@@ -73,10 +73,13 @@ def evaluate(
         progress: called with (finished episodes, all episodes) after every step.
 
     Raises:
+        ConfigError: the policy's agent was made for other scenes.
         GoalError: a goal does not exist, or no goal can be reached.
     """
+    check_evaluation(policy, scenes, history, batch_size, seed)
     if episodes is not None:
         start, goal = (ids.cpu() for ids in episodes)
+        check_pairs(scenes, start, goal)
     else:
         generator = torch.Generator().manual_seed(seed)
         start, goal = episode_starts(
@@ -283,6 +286,7 @@ def acting(policy: nn.Module, scenes: SceneSet, sample: bool = True, seed: int =
         scenes: on its device.
         sample, seed: see :func:`evaluate`.
     """
+    check_home(policy, scenes)
     modes = [(module, module.training) for module in policy.modules()]
     policy.eval()
     devices = [scenes.device] if scenes.device.type == "cuda" else []

@@ -11,15 +11,12 @@ from tensordict import NestedKey
 from tensordict.nn import (
     InteractionType,
     ProbabilisticTensorDictModule,
-    ProbabilisticTensorDictSequential,
     TensorDictSequential,
 )
-from tensordict.nn import TensorDictModule as Step
 from torch import Tensor, nn
 from torch.distributions import Categorical
 from torchrl.data import Unbounded
 from torchrl.envs.transforms import InitTracker, TensorDictPrimer, Transform
-from torchrl.modules import LSTMModule
 
 from vusfa.deprecated import moved_names
 from vusfa.errors import ConfigError
@@ -28,8 +25,10 @@ from vusfa.modules.config import AgentConfig, resolve_config
 from vusfa.modules.frames import FeatureFrames, PictureFrames, picture_table
 from vusfa.modules.policy import PolicyHead, SuccessorPolicyHead
 from vusfa.modules.siamese import SiameseEncoder
+from vusfa.modules.steps import Actor, Observing, Remembering, Step
 from vusfa.modules.successor import RewardHead, SuccessorHead, SuccessorValue, ValueHead
 from vusfa.modules.trunk import Fusion, SceneLayer, SiameseTrunk
+from vusfa.scenes import Home, check_scenes
 
 __all__ = ["Agent", "make_agent"]
 
@@ -67,6 +66,7 @@ def make_agent(model: str, architecture: str = "controlled", scenes: Any = None,
         raise ConfigError(
             "make_agent needs scenes=...; SceneSet.bundled() gives the four that come with the package"
         )
+    check_scenes(scenes)
     return (config.ideas.agent or Agent)(config, scenes)
 
 
@@ -95,6 +95,7 @@ class Agent(nn.Module):
     Attributes:
         config: plain dict, from which ``make_agent`` rebuilds the agent in the same scenes.
         num_scenes: scenes that the heads hold weights of; 1 with shared heads.
+        home: what it takes for granted of scenes; actor and critic know it, too.
         scene_slots: (n,) int64, where those of each scene are; None in order. See
             :class:`~vusfa.modules.SceneLinear`.
     """
@@ -115,6 +116,9 @@ class Agent(nn.Module):
         self.policy: nn.Module = self.make_policy(config, scenes.num_actions)
         self.memory = nn.LSTM(hidden, hidden, batch_first=True) if config.memory == "lstm" else None
         self._steps = self.make_steps(config)  # a plain dict: the layers are children under the names above
+        self.home = _home(self.config, scenes)
+        for step in self._steps.values():
+            step.home = self.home
 
     @property
     def is_tabular(self) -> bool:
@@ -219,9 +223,7 @@ class Agent(nn.Module):
                 chosen.append(step)
         return chosen[::-1]
 
-    def get_policy_operator(
-        self, out_keys: Sequence[NestedKey] = ("action", "action_log_prob")
-    ) -> ProbabilisticTensorDictSequential:
+    def get_policy_operator(self, out_keys: Sequence[NestedKey] = ("action", "action_log_prob")) -> Actor:
         """The actor. It computes psi only if its policy head reads it.
 
         Args:
@@ -238,9 +240,7 @@ class Agent(nn.Module):
             log_prob_key="action_log_prob",
         )
         recurrent = self._steps["memory"].out_keys[1:] if self.memory is not None else []
-        return ProbabilisticTensorDictSequential(
-            *self.actor_steps(), sampler, selected_out_keys=[*out_keys, *recurrent]
-        )
+        return Actor(*self.actor_steps(), sampler, selected_out_keys=[*out_keys, *recurrent])
 
     def get_value_operator(self) -> TensorDictSequential:
         """The critic; it leaves every key it writes, ``state_value`` the last."""
@@ -256,32 +256,15 @@ class Agent(nn.Module):
         return [InitTracker(), TensorDictPrimer(states, expand_specs=True)]
 
 
-class _SaysWhatIsMissing:
-    """A step whose error names the mend where the tensordict lacks an entry."""
-
-    mend: str
-
-    def forward(self, *args: Any, **entries: Any) -> Any:
-        """As without it."""
-        try:
-            return super().forward(*args, **entries)  # type: ignore[misc]
-        except KeyError as error:
-            raise ConfigError(f"the agent reads {self.in_keys}; {self.mend} ({error.args[0]})") from error  # type: ignore[attr-defined]
-
-
-class Observing(_SaysWhatIsMissing, Step):
-    """The step that reads observations."""
-
-    mend = (
-        "TargetNavEnv sends ids; for an agent with observation='features' or 'pixels' append the transform"
-        " vusfa.envs.SceneObservation(scenes, kind) to it"
+def _home(config: dict[str, Any], scenes: Any) -> Home:
+    return Home(
+        names=tuple(config["scenes"]),
+        fingerprint=config["fingerprint"],
+        num_actions=config["num_actions"],
+        feature_size=None if config["encoder"] == "conv" else scenes.feature_size,
+        reads_ids=config["observation"] == "index",
+        heads_per_scene=not config["shared_heads"],
     )
-
-
-class Remembering(_SaysWhatIsMissing, LSTMModule):
-    """The recurrent step."""
-
-    mend = "give the environment the transforms of agent.make_env_transforms()"
 
 
 def _plain(config: AgentConfig, scenes: Any) -> dict[str, Any]:

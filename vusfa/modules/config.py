@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Callable, Iterable
 from typing import Any, Literal, NamedTuple
 
 from vusfa.errors import ConfigError, near
+from vusfa.limits import MAX_CONV_SIDE, MAX_UNITS, brief
 
 __all__ = ["ARCHITECTURES", "MODELS", "AgentConfig", "Model", "register_model", "resolve_config"]
 
@@ -211,8 +213,16 @@ def _checked(config: AgentConfig) -> AgentConfig:
         _check_choice(name, getattr(config, name), choices)
     for name in ("history", "embedding_size", "hidden_size"):
         value = getattr(config, name)
-        if not isinstance(value, int) or isinstance(value, bool) or value < 1:
-            raise ConfigError(f"{name} is {value!r}; it must be a whole number of 1 or more")
+        if type(value) is not int or value < 1:
+            raise ConfigError(f"{name} is {brief(value)}; it must be a whole number of 1 or more")
+        if value > MAX_UNITS:
+            raise ConfigError(f"{name} is {brief(value)}; it must be at most {MAX_UNITS:,}")
+    for field in dataclasses.fields(config):
+        value = getattr(config, field.name)
+        if field.type == "bool" and type(value) is not bool:
+            raise ConfigError(f"{field.name} is {brief(value)}; it must be True or False")
+        if field.type.startswith("float") and not _is_finite(value) and value != field.default:
+            raise ConfigError(f"{field.name} is {brief(value)}; it must be a finite number")
     if (config.observation, config.encoder) in (("features", "conv"), ("pixels", "mlp")):
         raise ConfigError(
             f"observation {config.observation!r} does not go with encoder {config.encoder!r};"
@@ -249,8 +259,14 @@ def _two_sides(size: Any) -> tuple[int, int]:
     try:
         height, width = (int(side) for side in size)
     except (TypeError, ValueError):
-        raise ConfigError(f"picture_size is {size!r}; give height and width, such as [60, 80]") from None
+        raise ConfigError(f"picture_size is {brief(size)}; give height and width, such as [60, 80]") from None
+    if max(height, width) > MAX_CONV_SIDE:
+        raise ConfigError(f"picture_size is {brief(size)}; give at most {MAX_CONV_SIDE:,} pixels per side")
     return height, width
+
+
+def _is_finite(value: Any) -> bool:
+    return type(value) in (int, float) and math.isfinite(value)
 
 
 def _default(name: str) -> Any:
@@ -259,4 +275,4 @@ def _default(name: str) -> Any:
 
 def _check_choice(what: str, value: Any, choices: Iterable[Any]) -> None:
     if value not in choices:
-        raise ConfigError(f"{what} is {value!r}; {near(value, choices)}")
+        raise ConfigError(f"{what} is {brief(value)}; {near(value, choices)}")

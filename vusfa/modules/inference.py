@@ -25,10 +25,11 @@ from vusfa.errors import ConfigError
 from vusfa.modules.draws import action_probs, draw, draw_actions
 from vusfa.modules.precision import autocast_copy
 from vusfa.modules.rows import RowScenes, SceneBlocks, SortedByScene
+from vusfa.modules.steps import AtHome
 from vusfa.modules.tables import states_around, table_pays
 from vusfa.modules.trunk import CachedTrunk, SiameseTrunk, remember
 from vusfa.modules.unique import shapes_may_vary
-from vusfa.scenes import SceneSet
+from vusfa.scenes import SceneSet, check_home
 
 if TYPE_CHECKING:
     from vusfa.modules.agents import Agent
@@ -43,7 +44,7 @@ class _Layers(NamedTuple):
     heads: list[nn.Module]
 
 
-class InferencePolicy(TensorDictModuleBase):
+class InferencePolicy(AtHome, TensorDictModuleBase):
     """Inference-only policy: the same actions as the actor's, without intermediate tensors.
 
     It writes ``action``, the next state of an LSTM, and nothing else. Actions are drawn by default;
@@ -100,6 +101,7 @@ class InferencePolicy(TensorDictModuleBase):
                 goals' scenes.
         """
         before = self._layers, self._table
+        check_home(self, scenes)
         try:
             if scenes is not None and self.agent.is_tabular and table_pays(scenes, goals, rows):
                 self._table = [TabularPolicy(self.agent, scenes, goals)]
@@ -198,7 +200,7 @@ class InferencePolicy(TensorDictModuleBase):
         return torch.empty_like(logits).index_copy_(0, order, logits)
 
 
-class TabularPolicy(TensorDictModuleBase):
+class TabularPolicy(AtHome, TensorDictModuleBase):
     """Table of an agent that sees one frame by its id: logits of every state and goal of a scene.
 
     Where many steps are walked with the same weights, one large product for all pairs and a look-up per step
@@ -214,7 +216,7 @@ class TabularPolicy(TensorDictModuleBase):
         state, goal, scene: (P,) int64, of each pair: global ids, and the scene's index.
 
     Raises:
-        ValueError: for an agent that sees more than one frame, or something else than ids.
+        ValueError: for an agent of more than one frame, or of observations, or made for other scenes.
 
     >>> from tensordict import TensorDict
     >>> from vusfa.modules import make_agent
@@ -236,6 +238,8 @@ class TabularPolicy(TensorDictModuleBase):
                 f" memory={config['memory']}"
             )
         super().__init__()
+        check_home(agent, scenes)
+        self.home = agent.home
         self.in_keys, self.out_keys = ["state_id", "goal_id"], ["action"]
         every = torch.arange(scenes.num_states, device=scenes.device)
         goals = every if goals is None else goals.to(scenes.device).unique()  # sorted, hence scene by scene
@@ -292,8 +296,5 @@ def _tuple(written: Any) -> tuple[Any, ...]:
 
 __getattr__ = moved_names(
     __name__,
-    {
-        "ActingPolicy": "vusfa.modules.InferencePolicy",
-        "TabulatedPolicy": "vusfa.modules.TabularPolicy",
-    },
+    {"ActingPolicy": "vusfa.modules.InferencePolicy", "TabulatedPolicy": "vusfa.modules.TabularPolicy"},
 )

@@ -199,7 +199,7 @@ class SiameseEncoder(nn.Module):
         """
         if not self.by_id:
             return self._observed(state, goal)
-        self._check_history(state.shape[-1], "state_id")
+        self.check_history(state.shape[-1], "state_id")
         if not (self.deduplicate and shapes_may_vary(state)):
             lookup = self.frames.lookup
             return self._row_by_row(lookup(state[..., -self.history :]), lookup(goal))
@@ -250,10 +250,11 @@ class SiameseEncoder(nn.Module):
     def _newest(self, frames: Tensor, key: str) -> Tensor:
         """Features (\\*B, H, F) of the last H frames."""
         place = -1 - self.frames.frame_dims
-        self._check_history(frames.size(place), key)
+        self.check_history(frames.size(place), key)
         return self.frames.encode(frames.narrow(place, frames.size(place) - self.history, self.history))
 
-    def _check_history(self, frames: int, key: str) -> None:
+    def check_history(self, frames: int, key: str) -> None:
+        """Raise a ConfigError where an observation has fewer frames than the encoder reads."""
         if frames < self.history:
             raise ConfigError(
                 f"{key} has {frames} frames a row and the agent reads {self.history};"

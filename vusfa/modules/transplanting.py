@@ -8,6 +8,7 @@ from typing import Any
 from vusfa.errors import ConfigError
 from vusfa.modules.agents import Agent, make_agent
 from vusfa.modules.config import AgentConfig
+from vusfa.scenes import check_scenes
 
 __all__ = ["transplant"]
 
@@ -30,6 +31,7 @@ def transplant(agent: Agent, scenes: Any) -> Agent:
     >>> transplant(agent, other).config["scenes"]
     ['kitchen', 'bedroom']
     """
+    check_scenes(scenes)
     if not agent.config["shared_heads"]:
         raise ConfigError(
             "the agent has heads of its own for each scene; train one with agent.shared_heads=true to take"

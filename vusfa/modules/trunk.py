@@ -146,6 +146,7 @@ class CachedTrunk:
     def fused(self, state: Tensor, goal: Tensor) -> Tensor:
         """(R, hidden) of ids (R, H) and (R,)."""
         encoder, fusion = self.trunk.encoder, self.trunk.fusion
+        encoder.check_history(state.shape[1], "state_id")
         state = state[:, -encoder.history :]
         if self.place is not None:
             state = self.place[state]

@@ -12,7 +12,9 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 from torch.distributions import Distribution
 from torchrl.objectives.utils import ValueEstimators, dispatch_value_estimator, distance_loss
+from torchrl.objectives.value import ValueEstimatorBase
 
+from vusfa.limits import brief
 from vusfa.modules.unique import gather
 from vusfa.objectives.distribution import action_entropy, action_log_prob
 from vusfa.objectives.functional import explained_variance, policy_gradient_loss
@@ -129,6 +131,7 @@ class ActorCriticLoss(NetworkLoss):
             the loss itself.
 
         Raises:
+            TypeError: no estimator, and no name of one.
             ValueError: an unknown name.
             NotImplementedError: MAGAE, since there is one agent; VTrace beside a term of the successor
                 features, of which it computes no targets.
@@ -141,6 +144,12 @@ class ActorCriticLoss(NetworkLoss):
                 raise ValueError(f"{name}: value_type is {value_type!r}; give one of {sorted(by_name)}")
             value_type = by_name[value_type.lower()]
         if not isinstance(value_type, ValueEstimators):
+            is_class = isinstance(value_type, type) and issubclass(value_type, ValueEstimatorBase)
+            if not is_class and not isinstance(value_type, ValueEstimatorBase):
+                raise TypeError(
+                    f"{name}: value_type is {brief(value_type)}; give a name such as 'gae', one of"
+                    " torchrl.objectives.ValueEstimators, or an estimator"
+                )
             super().make_value_estimator(value_type, **hyperparams)
         elif value_type in LAMBDAS:
             hyperparams = {"lmbda": LAMBDAS[value_type], "value_network": self.critic_network, **hyperparams}

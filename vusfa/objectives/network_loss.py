@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import math
 from collections.abc import Iterator, Mapping
 from typing import Any
 
@@ -119,6 +120,8 @@ class NetworkLoss(LossModule):
         """Buffers of floating point, even for whole numbers: they are set by assignment later on."""
         device, dtype = self._default_device, torch.get_default_dtype()
         for name, value in values.items():
+            if isinstance(value, int | float) and not math.isfinite(value):
+                raise ValueError(f"{type(self).__name__}: {name} is {value}; give a finite number")
             self.register_coeff_buffer(name, value, device=device, dtype=dtype)
 
     def _set_action_keys(self) -> None:

@@ -26,6 +26,7 @@ __all__ = [
     "check",
     "check_scans",
     "decode",
+    "decoded",
     "look",
     "open_image",
     "raw_blocks",
@@ -182,7 +183,21 @@ def raw_blocks(path: Path, states: np.ndarray) -> Iterator[np.ndarray]:
         yield read_pictures(path, states[first : first + at_once])
 
 
-def check(path: Path, num_states: int, most: int | None = None) -> None:
+def decoded(path: Path) -> tuple[int, int]:
+    """How many pictures of a file :func:`check` decodes where it is not asked for all, and how many there
+    are.
+
+    >>> from vusfa.scenes.store import bundled_path
+    >>> decoded(bundled_path("bathroom"))
+    (176, 176)
+    """
+    with opened(path) as file:
+        (shape, _), found = look(file, None), _find(file)
+        number = 0 if shape is None or found is None else len(found[1])
+    return (min(number, max(1, limits.MAX_DECODED_PIXELS // (shape[0] * shape[1]))) if shape else 0), number
+
+
+def check(path: Path, num_states: int, every: bool = False) -> None:
     """Check the pictures of a file: the header and the end of each, then by decoding.
 
     Truncated pictures, other sizes and other data are thus found in seconds, in a file of any size.
@@ -190,7 +205,7 @@ def check(path: Path, num_states: int, most: int | None = None) -> None:
     Args:
         path: the file.
         num_states: N.
-        most: number of pictures to decode, evenly spaced; None for all.
+        every: decode all pictures, however long it takes, not as many as :func:`decoded` says.
 
     Raises:
         SceneError: a picture cannot be used; the message names the first one.
@@ -208,7 +223,7 @@ def check(path: Path, num_states: int, most: int | None = None) -> None:
                             image.load()
             except OSError as error:
                 raise _unusable(path, state, error) from error
-    count = num_states if most is None else min(most, num_states)
+    count = num_states if every else decoded(path)[0]
     for _ in raw_blocks(path, np.linspace(0, num_states - 1, count, dtype=np.int64)):
         pass
 

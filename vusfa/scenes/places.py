@@ -5,13 +5,13 @@ from __future__ import annotations
 import os
 import warnings
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from glob import glob
 from pathlib import Path
 from typing import Any
 
 from vusfa.errors import SceneError
-from vusfa.limits import LAZY_SCENES, MAX_FAULTS
+from vusfa.limits import LAZY_SCENES, MAX_FAULTS, brief
 from vusfa.scenes.scene import Scene
 
 __all__ = ["Sources", "expanded", "files_in", "listed", "open_scenes"]
@@ -39,6 +39,8 @@ def expanded(scenes: Sources, keep: Callable[[str], bool] = lambda path: True) -
     """
     found: list[Any] = []
     for source in listed(scenes):
+        if not isinstance(source, str | os.PathLike):
+            raise SceneError(f"{brief(source)} is no scene; give names and files, such as ['bathroom']")
         text = os.fspath(source)
         if os.path.isdir(text):
             inside = files_in(text)
@@ -90,4 +92,4 @@ def open_scenes(
 
 def listed(scenes: Sources) -> list[Any]:
     """One name or path, or several, as a list."""
-    return [scenes] if isinstance(scenes, str | os.PathLike) else list(scenes)
+    return list(scenes) if isinstance(scenes, Iterable) and not isinstance(scenes, str) else [scenes]

@@ -18,13 +18,14 @@ import torch
 from torch import Tensor
 
 from vusfa.errors import SceneError
+from vusfa.limits import brief
 from vusfa.scenes import store
 from vusfa.scenes.arrays import from_arrays, save
 from vusfa.scenes.features import FeaturesField, StoredFeatures
 from vusfa.scenes.graph import as_states, default_actions, weak_components
 from vusfa.scenes.paths import DistanceField, ShortestPaths
 from vusfa.scenes.pictures import read_pictures
-from vusfa.scenes.validation import array_faults, raise_faults
+from vusfa.scenes.validation import array_faults, name_faults, raise_faults
 
 __all__ = ["Scene"]
 
@@ -88,8 +89,8 @@ class Scene:
         arrays.setdefault("location", np.zeros((num_states, 2)))
         arrays.setdefault("rotation", np.zeros(num_states))
         actions = None if self.actions is None else tuple(self.actions)
-        source = f"scene {self.name!r}" if self.path is None else self.path
-        raise_faults(source, array_faults(arrays, actions, optional=["shortest_path_distance"]))
+        faults = array_faults(arrays, actions, optional=["shortest_path_distance"])
+        raise_faults(self.path or f"scene {brief(self.name)}", [*name_faults(self.name), *faults])
         self._set(arrays, actions)
 
     def _set(
@@ -160,10 +161,10 @@ class Scene:
         if isinstance(source, str) and not Path(source).suffix and os.sep not in source:
             if source in store.bundled_names():
                 return cls.load(store.bundled_path(source), lazy)
-            if not Path(source).is_file():
+            if not os.path.isfile(source):
                 raise SceneError(
-                    f"{source!r} is neither a bundled scene ({', '.join(store.bundled_names())}) nor a file;"
-                    f" check the name"
+                    f"{brief(source)} is neither a bundled scene ({', '.join(store.bundled_names())}) nor a"
+                    " file; check the name"
                 )
         return cls.load(source, lazy)
 

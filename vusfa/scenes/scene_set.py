@@ -70,6 +70,7 @@ class SceneSet:
         # NumPy: torch's threads hang in a forked process whose parent has used them.
         sizes = [scene.num_states for scene in self.scenes]
         offsets = np.cumsum([0, *sizes])
+        self._known: list[str] = []  # the fingerprint, once somebody has asked; shared with copies
         tables = [successor_table(scene.graph) for scene in self.scenes]
         self.offsets = torch.from_numpy(offsets)
         self.successor = _joined([t.numpy() + n for (t, _), n in zip(tables, offsets[:-1], strict=True)])
@@ -276,10 +277,10 @@ class SceneSet:
         >>> SceneSet.bundled(["bathroom"]).fingerprint == SceneSet.open("bathroom").fingerprint
         True
         """
-        if "_fingerprint" not in self.__dict__:
-            scenes = self.scenes
-            self._fingerprint = self.features.summary.fingerprint if self.is_lazy else fingerprint(scenes)
-        return self._fingerprint
+        known: list[str] = self.__dict__.setdefault("_known", [])  # copies on other devices share it
+        if not known:
+            known.append(self.features.summary.fingerprint if self.is_lazy else fingerprint(self.scenes))
+        return known[0]
 
     def __getstate__(self) -> dict[str, Any]:
         # the scenes only; the tables are rebuilt from them

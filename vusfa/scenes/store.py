@@ -26,7 +26,7 @@ import torch
 
 from vusfa.deprecated import moved_names
 from vusfa.errors import SceneError
-from vusfa.limits import MAX_NAME, TABLE_STATES, brief
+from vusfa.limits import TABLE_STATES
 from vusfa.scenes import pictures as picture_files
 from vusfa.scenes.features import StoredFeatures, stamp_of
 from vusfa.scenes.hdf5 import (
@@ -41,7 +41,7 @@ from vusfa.scenes.hdf5 import (
     replaced,
     row_blocks,
 )
-from vusfa.scenes.validation import DATASETS, array_faults, shape_fault
+from vusfa.scenes.validation import DATASETS, array_faults, name_faults, shape_fault
 
 __all__ = ["Dump", "bundled_names", "bundled_path", "read", "validate", "write"]
 
@@ -119,11 +119,7 @@ def read(path: str | os.PathLike[str], lazy: bool = False) -> Dump:
         stamp = stamp_of(path)
         attributes = read_attributes(file, check_heaps(path))
         dump = Dump(name=str(attributes.pop("scene", path.stem)))
-        if len(dump.name) > MAX_NAME or not dump.name.isprintable():
-            dump.reading_faults.append(
-                f"attribute 'scene' is {brief(dump.name)}; give a name of at most {MAX_NAME} printable"
-                f" characters"
-            )
+        dump.reading_faults += name_faults(dump.name)
         if "actions" in attributes:
             dump.actions = tuple(str(action) for action in np.atleast_1d(attributes.pop("actions")))
         dump.attributes = attributes
@@ -162,15 +158,15 @@ def read(path: str | os.PathLike[str], lazy: bool = False) -> Dump:
     return dump
 
 
-def validate(path: str | os.PathLike[str], most_pictures: int | None = None) -> list[str]:
+def validate(path: str | os.PathLike[str], every_picture: bool = False) -> list[str]:
     """All faults of a scene file at once; an empty list for a sound file.
 
     Each line names the file, the dataset, the state and the remedy.
 
     Args:
         path: the file.
-        most_pictures: number of pictures to decode, evenly spaced; None for all. The header and the end of
-            every picture are checked first.
+        every_picture: decode all pictures. By default the header and the end of each are checked, and as many
+            decoded, evenly spaced, as a few seconds suffice for: all, in a room of common size.
 
     >>> validate(bundled_path("bathroom"))
     []
@@ -185,7 +181,7 @@ def validate(path: str | os.PathLike[str], most_pictures: int | None = None) -> 
     faults = [f"{path}: {fault}" for fault in dump.faults()]
     if dump.picture_shape is not None and "graph" in dump.arrays and dump.arrays["graph"].ndim:
         try:
-            picture_files.check(path, len(dump.arrays["graph"]), most_pictures)
+            picture_files.check(path, len(dump.arrays["graph"]), every_picture)
         except SceneError as error:
             faults.append(str(error))
     return faults

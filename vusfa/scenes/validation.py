@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from vusfa.errors import SceneError
-from vusfa.limits import MAX_FAULTS, TABLE_STATES, brief
+from vusfa.limits import MAX_FAULTS, MAX_NAME, TABLE_STATES, brief
 from vusfa.scenes.graph import shortest_path_distances
 from vusfa.scenes.hdf5 import row_blocks
 
@@ -30,6 +30,7 @@ __all__ = [
     "distance_faults",
     "feature_faults",
     "graph_faults",
+    "name_faults",
     "pose_faults",
     "raise_faults",
     "shape_fault",
@@ -193,6 +194,17 @@ def _inconsistent_state(graph: np.ndarray, distance: np.ndarray) -> int | None:
         if off.any():
             return first + int(off.argmax())
     return None
+
+
+def name_faults(name: object) -> list[str]:
+    """The fault of a scene's name, if it has one.
+
+    >>> name_faults("")
+    ["attribute 'scene' is ''; give a name of 1 to 200 printable characters"]
+    """
+    if isinstance(name, str) and 0 < len(name) <= MAX_NAME and name.isprintable():
+        return []
+    return [f"attribute 'scene' is {brief(name)}; give a name of 1 to {MAX_NAME} printable characters"]
 
 
 def array_faults(

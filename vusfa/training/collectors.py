@@ -30,8 +30,8 @@ from torchrl.envs.transforms import Compose, Transform
 from vusfa.cluster.ray_workers import RayWorkers
 from vusfa.envs import TargetNavEnv
 from vusfa.errors import CheckpointError, ConfigError, WorkerError
-from vusfa.limits import brief
-from vusfa.scenes import SceneSet
+from vusfa.limits import MAX_BATCH_FRAMES, brief
+from vusfa.scenes import SceneSet, check_home
 from vusfa.torchrl_private import carrier, end_weight_sharing, put_carrier
 from vusfa.training.content import check_like, mended, restore
 from vusfa.training.workers import begin_worker, started, watch
@@ -90,6 +90,11 @@ def rows_per_worker(kind: str, num_envs: int, num_workers: int, rollout: int = 1
         )
     if rollout < 1:
         raise ConfigError(f"collector.rollout is {rollout}; it must be 1 or more")
+    if num_envs * rollout > MAX_BATCH_FRAMES:
+        raise ConfigError(
+            f"collector.num_envs is {brief(num_envs)} and collector.rollout {brief(rollout)}; a batch has"
+            f" at most {MAX_BATCH_FRAMES:,} frames"
+        )
     if kind == "single":
         return num_envs
     if num_envs % num_workers:
@@ -148,8 +153,8 @@ def make_collector(
         address, resources: of :class:`~vusfa.cluster.ray_workers.RayWorkers`, for ``ray``.
 
     Raises:
-        ConfigError: see :func:`rows_per_worker`; for ``ray`` also
-            :func:`~vusfa.cluster.ray_workers.connected`.
+        ConfigError: see :func:`rows_per_worker`; the policy's agent was made for other scenes; for ``ray``
+            also :func:`~vusfa.cluster.ray_workers.connected`.
         WorkerError: the workers cannot start.
     """
     rows = rows_per_worker(kind, num_envs, num_workers, rollout)
@@ -161,6 +166,7 @@ def make_collector(
     # Made here in any case: what is wrong with the settings then shows as an error of ours, not as a
     # worker's.
     env = make_env(batch_size=[rows], first_goal=first_goal, seed=seed)
+    check_home(policy, env)
     if kind == "single":
         # Told where everything is, the collector does not copy each step to see that it is there.
         shared |= {"device": env.device, "track_traj_ids": False}

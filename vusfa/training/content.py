@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import math
 import os
+import re
 import zipfile
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -169,6 +170,8 @@ def check_entries(path: str | Path, state: Mapping[str, Any]) -> None:
     for name in ("frames", "updates", "seconds"):
         if not 0 <= state[name] < math.inf:
             raise mended(path, f"its entry {name!r} is {brief(state[name])}, not 0 or more")
+    if not re.fullmatch(r"[\w.-]{0,128}", state["run_id"], re.ASCII):
+        raise mended(path, f"its entry 'run_id' is {brief(state['run_id'])}, no id of a run")
     for name in ("scenes.sources", "scenes.names", "overrides"):
         group, _, key = name.rpartition(".")
         if not all(isinstance(item, str) for item in (state[group] if group else state)[key]):

@@ -11,11 +11,13 @@ from tensordict.nn import TensorDictModuleBase
 from torchrl.collectors import BaseCollector
 
 from vusfa.algorithms import make_algorithm, threads_per_step
+from vusfa.conf.settings import LARGEST
 from vusfa.envs import SceneObservation, SceneRotation, resolve_goals
 from vusfa.envs.observation import crop_index
 from vusfa.envs.rotation import Rotation
 from vusfa.envs.scene_env import usable_device
 from vusfa.errors import ConfigError
+from vusfa.limits import brief
 from vusfa.modules import Agent, make_agent
 from vusfa.scenes import SceneSet
 from vusfa.training.active_heads import ActiveHeads
@@ -211,7 +213,7 @@ def set_threads(threads: int) -> None:
     (:func:`~vusfa.training.memory.keep_memory`).
 
     Raises:
-        ConfigError: fewer than one.
+        ConfigError: fewer than one, or more than any machine has.
 
     >>> before = torch.get_num_threads()
     >>> set_threads(1)
@@ -219,7 +221,7 @@ def set_threads(threads: int) -> None:
     1
     >>> set_threads(before)
     """
-    if threads < 1:
-        raise ConfigError(f"threads is {threads}; give 1 or more")
+    if not 1 <= threads <= LARGEST["threads"]:
+        raise ConfigError(f"threads is {brief(threads)}; give 1 to {LARGEST['threads']:,}")
     torch.set_num_threads(threads)
     keep_memory()

@@ -23,7 +23,7 @@ from torchrl.collectors import BaseCollector, Collector
 from vusfa.algorithms import Algorithm, annealed
 from vusfa.envs import SceneObservation
 from vusfa.modules import Agent, InferencePolicy
-from vusfa.scenes import SceneSet
+from vusfa.scenes import SceneSet, check_home
 from vusfa.training.active_heads import ActiveHeads
 from vusfa.training.checkpoint import (
     check_fits,
@@ -92,6 +92,7 @@ class Trainer:
         heads: ActiveHeads | None = None,
         ranks: Ranks | None = None,
     ) -> None:
+        check_home(agent, scenes)
         self.scenes, self.goals, self.agent = scenes, goals, agent
         self.algorithm, self.optimizer = algorithm, optimizer
         self.settings, self.overrides = settings, overrides
