@@ -4,21 +4,24 @@ from __future__ import annotations
 
 import re
 import sys
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import torch
 
+from vusfa.cluster.cells import Cell, run_cells
 from vusfa.errors import SceneError
 from vusfa.evaluation import Episodes, evaluate, print_summary, random_walk_summary, summary
 from vusfa.evaluation.exact import exact_goals, uniform_probabilities
-from vusfa.experiments.runs import Run, write_run
+from vusfa.experiments.runs import Run, read_run, write_run
 from vusfa.experiments.training import compose_settings, train
+from vusfa.files import say
 from vusfa.modules import InferencePolicy, TriedActions, transplant
 from vusfa.scenes import SceneSet
 from vusfa.training import EvaluationProgress, load_agent, run_facts
 
-__all__ = ["generalise", "policies", "split_rooms"]
+__all__ = ["generalise", "generalise_cell", "policies", "split_rooms"]
 
 
 def split_rooms(folder: Path, trained: int, tested: int) -> tuple[list[str], list[str]]:
@@ -57,6 +60,7 @@ def generalise(
     *,
     name: str = "vusfa",
     seed: int = 0,
+    seeds: list[int] = [],  # noqa: B006
     trained: int = 32,
     tested: int = 8,
     weight: float = 3.0,
@@ -64,18 +68,23 @@ def generalise(
     episodes: int = 10,
     results: Path = Path("results"),
     runs: Path = Path("runs"),
+    again: bool = False,
+    launcher: str = "serial",
+    launcher_options: list[str] = [],  # noqa: B006
 ) -> None:
     """Train in some rooms, test in others that the agent has never seen.
 
     The agent, whose heads are the same for all rooms, walks to every goal of the other rooms as it is and
     with a memory of the episode; beside it the random walk and the memory alone. Results go to
-    RESULTS/generalise/NAME-SEED; ``vusfa tables generalise`` prints the table of all seeds, with intervals.
+    RESULTS/generalise/NAME-SEED, and existing ones are skipped; ``vusfa tables generalise`` prints the table
+    of all seeds, with intervals.
 
     Args:
         rooms: folder of dumps (.h5).
         overrides: settings of vusfa train over those of preset=unseen.
         name: of the results, before the seed.
         seed: of everything.
+        seeds: of several agents, in place of one seed.
         trained: rooms to train on.
         tested: rooms to test in.
         weight: of the memory: off the logits for each time that an action was tried here.
@@ -83,14 +92,48 @@ def generalise(
         episodes: to every goal of the rooms to test in.
         results: where results are written.
         runs: where the checkpoint is kept.
+        again: test the agents of existing results again.
+        launcher, launcher_options: what runs the cells: serial, local, slurm or ray (docs/cluster.md).
     """
-    torch.set_num_threads(1)
+    how: dict[str, Any] = {"weight": weight, "temperature": temperature, "episodes": episodes}
+    how |= {"results": results, "runs": runs}
     first, last = split_rooms(rooms, trained, tested)
+    compose_settings(["preset=unseen", *overrides])  # mistakes show before any work
+    cells = {
+        each: Cell(
+            results / "generalise" / f"{name}-{each}",
+            partial(generalise_cell, first, last, overrides, name, each, how),
+        )
+        for each in seeds or [seed]
+    }
+    run_cells(list(cells.values()), launcher, launcher_options, again)
+    unseen = SceneSet.open(last)
+    none, every = torch.tensor([], dtype=torch.int64), torch.arange(unseen.num_states)
+    for each in cells:
+        tables = read_run(results, "generalise", f"{name}-{each}").episodes
+        rows = [row for who, table in tables.items() for row in summary(table, who)]
+        print_summary([*rows, *random_walk_summary(unseen, every, none)])
+    say(f"vusfa tables generalise --results {results} shows all seeds with intervals")
+
+
+def generalise_cell(
+    first: list[str], last: list[str], overrides: list[str], name: str, seed: int, how: dict[str, Any]
+) -> Path:
+    """Train one agent, unless its checkpoint is there, and test it in rooms that it has never seen.
+
+    Args:
+        first, last: dumps to train on, and to test in.
+        overrides, name, seed, how: arguments of :func:`generalise`, the others by name.
+    """
+    weight, temperature, episodes = (how[each] for each in ("weight", "temperature", "episodes"))
+    results, runs = how["results"], how["runs"]
+    torch.set_num_threads(1)
     unseen, folder = SceneSet.open(last), runs / "generalise" / f"{name}-{seed}"
     settings = ["preset=unseen", *overrides, f"seed={seed}", f"scenes=[{','.join(first)}]"]
-    cfg = compose_settings([*settings, f"folder={folder}", "evaluation=none"])
-    if not (folder / "checkpoint.pt").exists() and (code := train(cfg, settings).exit_code):
-        sys.exit(code)
+    if not (folder / "checkpoint.pt").exists():
+        cfg = compose_settings([*settings, f"folder={folder}", "evaluation=none"])
+        if code := train(cfg, settings).exit_code:
+            sys.exit(code)
     agent, _, state = load_agent(folder / "checkpoint.pt")
     tables: dict[str, Episodes] = {}
     with EvaluationProgress() as progress:
@@ -107,8 +150,4 @@ def generalise(
     facts = {**run_facts(state, overrides), "trained_in": [Path(p).stem for p in first]}
     info = {**facts, "memory_weight": weight, "temperature": temperature, "tested_in": list(unseen.names)}
     walk = exact_goals(uniform_probabilities(unseen.num_actions), unseen)
-    print(write_run(results, Run("generalise", f"{name}-{seed}", info, tables, walk)))
-    rows = [row for who, table in tables.items() for row in summary(table, who)]
-    none, every = torch.tensor([], dtype=torch.int64), torch.arange(unseen.num_states)
-    print_summary([*rows, *random_walk_summary(unseen, every, none)])
-    print(f"vusfa tables generalise --results {results} shows all seeds with intervals", file=sys.stderr)
+    return write_run(results, Run("generalise", f"{name}-{seed}", info, tables, walk))

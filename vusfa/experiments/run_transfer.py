@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import time
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 from rich.console import Console
 from rich.progress import track
 
+from vusfa.cluster.cells import Cell, run_cells
 from vusfa.errors import CheckpointError
 from vusfa.experiments.fine_tune import fine_tune, fine_tuning_settings
 from vusfa.experiments.runs import Run, read_run, write_run
@@ -15,7 +18,7 @@ from vusfa.experiments.transfer import FINE_TUNED, FROM_SCRATCH, KINDS, new_goal
 from vusfa.modules.config import MODELS
 from vusfa.training import load_agent, run_facts, set_threads
 
-__all__ = ["run_transfer"]
+__all__ = ["run_transfer", "transfer_cell"]
 
 
 def run_transfer(
@@ -30,6 +33,8 @@ def run_transfer(
     results: Path = Path("results"),
     runs: Path = Path("runs"),
     experiment: str = "transfer",
+    launcher: str = "serial",
+    launcher_options: list[str] = [],  # noqa: B006
 ) -> None:
     """Fine-tune the trained models of Table 1 towards new goals near and far; train from scratch beside it.
 
@@ -47,35 +52,56 @@ def run_transfer(
         results: where results are read and written.
         runs: where that experiment's checkpoints lie.
         experiment: where results go.
+        launcher, launcher_options: what runs the cells: serial, local, slurm or ray (docs/cluster.md).
     """
+    numbers: dict[str, Any] = {"sets": sets, "frames": frames, "every": every}
+    places: dict[str, Any] = {"source": source, "results": results, "runs": runs, "experiment": experiment}
+    cells = [
+        Cell(
+            results / experiment / f"{model}-{seed}-{kind}",
+            partial(transfer_cell, model, seed, kind, numbers, places),
+        )
+        for seed in seeds
+        for kind in kinds
+        for model in models
+    ]
+    run_cells(cells, launcher, launcher_options)
+
+
+def transfer_cell(model: str, seed: int, kind: str, numbers: dict[str, int], places: dict[str, Any]) -> Path:
+    """Fine-tune one trained model towards the sets of one kind of goals, and train from scratch beside it.
+
+    Args:
+        model, seed, kind: of the cell.
+        numbers, places: arguments of :func:`run_transfer` by name.
+
+    Raises:
+        ResultError, CheckpointError: the model's result or checkpoint is missing.
+    """
+    sets, frames, every = (numbers[name] for name in ("sets", "frames", "every"))
+    source, results, runs, experiment = (places[n] for n in ("source", "results", "runs", "experiment"))
     set_threads(1)
-    for seed in seeds:
-        for kind in kinds:
-            for model in models:
-                name = f"{model}-{seed}-{kind}"
-                if (results / experiment / name / "cell.json").exists():
-                    print(f"{results / experiment / name}: already there")
-                    continue
-                trained = read_run(results, source, f"{model}-{seed}").info["checkpoint"]
-                checkpoint = runs / source / f"{model}-{seed}" / trained
-                if not checkpoint.exists():
-                    raise CheckpointError(f"{checkpoint}: missing; run vusfa table1 with the same --runs")
-                _, scenes, state = load_agent(checkpoint)
-                began, curves = time.monotonic(), []
-                for index in track(range(sets), description=name, console=Console(stderr=True)):
-                    goals = new_goals(scenes, state["goals"], kind, index)
-                    settings = fine_tuning_settings(state["config"], goals, frames, seed)
-                    pair = {
-                        label: fine_tune(start, settings, scenes, every=every)
-                        for label, start in ((FINE_TUNED, state), (FROM_SCRATCH, None))
-                    }
-                    curves.append({"goals": goals.tolist(), **pair})
-                info = {
-                    **run_facts(state),
-                    "kind": kind,
-                    "frames": frames,
-                    "cell_s": round(time.monotonic() - began, 1),
-                    "command": f"recipes/transfer.py run --models {model} --seeds {seed} --kinds {kind}",
-                    "curves": curves,
-                }
-                print(write_run(results, Run(experiment, name, info, {})))
+    name = f"{model}-{seed}-{kind}"
+    trained = read_run(results, source, f"{model}-{seed}").info["checkpoint"]
+    checkpoint = runs / source / f"{model}-{seed}" / trained
+    if not checkpoint.exists():
+        raise CheckpointError(f"{checkpoint}: missing; run vusfa table1 with the same --runs")
+    _, scenes, state = load_agent(checkpoint)
+    began, curves = time.monotonic(), []
+    for index in track(range(sets), description=name, console=Console(stderr=True)):
+        goals = new_goals(scenes, state["goals"], kind, index)
+        settings = fine_tuning_settings(state["config"], goals, frames, seed)
+        pair = {
+            label: fine_tune(start, settings, scenes, every=every)
+            for label, start in ((FINE_TUNED, state), (FROM_SCRATCH, None))
+        }
+        curves.append({"goals": goals.tolist(), **pair})
+    info = {
+        **run_facts(state),
+        "kind": kind,
+        "frames": frames,
+        "cell_s": round(time.monotonic() - began, 1),
+        "command": f"recipes/transfer.py run --models {model} --seeds {seed} --kinds {kind}",
+        "curves": curves,
+    }
+    return write_run(results, Run(experiment, name, info, {}))

@@ -1,14 +1,17 @@
-"""Zero-shot evaluation of a checkpoint: ``vusfa evaluate``."""
+"""Zero-shot evaluation of checkpoints: ``vusfa evaluate``."""
 
 from __future__ import annotations
 
 import sys
+from functools import partial
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 
+from vusfa.cluster.cells import Cell, run_cells
 from vusfa.envs.dynamics import MAX_STEPS
+from vusfa.errors import ConfigError
 from vusfa.evaluation import compare, print_summary
 from vusfa.experiments.manifest import BUNDLED_MANIFEST, read_manifest
 from vusfa.experiments.measure import evaluation_policy, evaluation_precision
@@ -24,11 +27,11 @@ from vusfa.training import (
     set_threads,
 )
 
-__all__ = ["zero_shot"]
+__all__ = ["evaluate_checkpoint", "zero_shot"]
 
 
 def zero_shot(
-    checkpoint: Path,
+    checkpoint: list[Path],
     *,
     scenes: list[str] | None = None,
     episodes: int = 10,
@@ -41,14 +44,17 @@ def zero_shot(
     device: str = "cpu",
     threads: int = 1,
     out: Path | None = None,
+    again: bool = True,
+    launcher: str = "serial",
+    launcher_options: list[str] = [],  # noqa: B006
 ) -> None:
-    """Evaluate a checkpoint towards every state of its scenes.
+    """Evaluate checkpoints towards every state of their scenes.
 
     Trained and unseen goals are separate tables, beside the random walk, the untrained network and the
-    shortest path. zero_shot.csv, zero_shot.json and zero_shot_episodes.csv are written beside the checkpoint.
+    shortest path. zero_shot.csv, .json and zero_shot_episodes.csv are written beside each checkpoint.
 
     Args:
-        checkpoint: the file, or the folder of a run.
+        checkpoint: files, or folders of runs.
         scenes: bundled names and files, in order, if they have moved since the training.
         episodes: per goal.
         max_steps: limit of actions per episode.
@@ -62,11 +68,40 @@ def zero_shot(
         device: where to compute.
         threads: processor threads; more than 1 pays on an idle machine only.
         out: where to write, without suffix; zero_shot beside the checkpoint by default.
+        again: false skips a checkpoint that has an evaluation.
+        launcher, launcher_options: what runs the cells: serial, local, slurm or ray (docs/cluster.md).
     """
+    given = [checkpoint] if isinstance(checkpoint, str | Path) else checkpoint  # one, from Python
+    if out is not None and len(given) > 1:
+        raise ConfigError(
+            f"out is '{out}', one place for {len(given)} evaluations; give one checkpoint, or no out"
+        )
+    files = [checkpoint_file(each) for each in given]
+    how: dict[str, Any] = {"scenes": scenes, "episodes": episodes, "max_steps": max_steps, "goals": goals}
+    how |= {"manifest": manifest, "greedy": greedy, "unreachable": unreachable}
+    how |= {"seed": seed, "device": device, "threads": threads}
+    places = {file: out or file.with_name("zero_shot") for file in files}
+    for stem in places.values():
+        check_folder(stem.parent, "out")
+    cells = [
+        Cell(stem.with_name(f"{stem.name}_episodes.csv"), partial(evaluate_checkpoint, file, stem, **how))
+        for file, stem in places.items()
+    ]
+    run_cells(cells, launcher, launcher_options, again)
+
+
+def evaluate_checkpoint(checkpoint: Path, stem: Path, **how: Any) -> str:
+    """Evaluate one checkpoint, print its table, write it to ``STEM.csv`` and so on, and return the paths.
+
+    Args:
+        checkpoint: the file.
+        stem: where to write, without suffix.
+        how: arguments of :func:`zero_shot` by name.
+    """
+    scenes, manifest, seed, device = (how[name] for name in ("scenes", "manifest", "seed", "device"))
+    episodes, max_steps, goals = (how[name] for name in ("episodes", "max_steps", "goals"))
+    greedy, unreachable, threads = (how[name] for name in ("greedy", "unreachable", "threads"))
     set_threads(threads)
-    checkpoint = checkpoint_file(checkpoint)
-    stem = out or checkpoint.with_name("zero_shot")
-    check_folder(stem.parent, "out")
     rooms = None if scenes is None else SceneSet.open(scenes)
     agent, world, state = load_agent(checkpoint, rooms, device=device)
     walks = (
@@ -97,6 +132,5 @@ def zero_shot(
         raise KeyboardInterrupt("interrupted; nothing has been written") from interrupt
     result.settings["manifest"] = manifest
     print_summary(result.rows, note=result.note)
-    for path in result.save(stem):
-        print(path)
     print(f"next: vusfa report {checkpoint.parent}, vusfa film {checkpoint.parent}", file=sys.stderr)
+    return "\n".join(map(str, result.save(stem)))
