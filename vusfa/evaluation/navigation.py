@@ -1,8 +1,7 @@
 """Batched rollouts of evaluation episodes.
 
 The rules are the environment's own (:mod:`vusfa.envs.dynamics`), on a batch that shrinks: an episode that
-ends leaves it at once and a waiting one takes its row, so the few long episodes at the end do not cost a full
-batch per step.
+ends leaves it at once and a waiting one takes its row. So a few long episodes do not cost full batches.
 """
 
 from __future__ import annotations
@@ -52,8 +51,7 @@ def evaluate(
 ) -> Episodes:
     """Roll out ``episodes_per_goal`` episodes to every goal.
 
-    All draws come from ``seed``; the caller's random state stays, so an evaluation during a training does not
-    change the training. The policy is in evaluation mode meanwhile.
+    All draws come from ``seed``; the caller's random state stays. The policy is in evaluation mode meanwhile.
 
     Args:
         policy: reads ``state_id`` (n, H), ``goal_id`` (n,), ``scene_id`` (n,) and writes ``action`` (n,).

@@ -152,8 +152,7 @@ class Trainer:
         Args:
             batches: those of :meth:`collecting`.
 
-        Returns:
-            the batch, and the numbers to log: the losses' terms and the gradient's norm.
+        Returns: the batch, and the numbers to log: the losses' terms and the gradient's norm.
         """
         began = time.monotonic()
         self.algorithm.show_crops()
