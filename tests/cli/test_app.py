@@ -47,7 +47,7 @@ def test_an_error_is_one_line_and_exit_code_1(run: Callable[..., Any]) -> None:
 
 
 def test_ctrl_c_is_exit_code_130(run: Callable[..., Any], monkeypatch: pytest.MonkeyPatch) -> None:
-    def stop(path: object) -> list[str]:
+    def stop(*_: object) -> list[str]:
         raise KeyboardInterrupt
 
     monkeypatch.setattr("vusfa.scenes.validate", stop)
@@ -58,7 +58,7 @@ def test_ctrl_c_is_exit_code_130(run: Callable[..., Any], monkeypatch: pytest.Mo
 def test_errors_of_the_program_are_not_hidden(
     run: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("vusfa.scenes.validate", lambda path: 1 / 0)
+    monkeypatch.setattr("vusfa.scenes.validate", lambda *_: 1 / 0)
     assert isinstance(run("check", "x.h5").exception, ZeroDivisionError)
 
 
@@ -68,7 +68,7 @@ def test_a_signal_ends_a_process_that_cleans_up(
 ) -> None:
     text = f"""
 import os, time, vusfa.scenes, vusfa.cli
-def hang(path):
+def hang(*_):
     try:
         os.kill(os.getpid(), {int(number)})
         time.sleep(30)

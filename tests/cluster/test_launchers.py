@@ -63,6 +63,7 @@ def test_jobs_of_slurm(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         (programs / name).write_text(text)
         (programs / name).chmod(0o755)
     monkeypatch.setenv("PATH", f"{programs}:{Path('/usr/bin')}:{Path('/bin')}")
+    monkeypatch.setenv("PYTHONPATH", str(Path(work.__file__).parents[2]))  # jobs import the cells' functions
     monkeypatch.chdir(tmp_path)
     log = tmp_path / "log"
     run_cells(cells_of(tmp_path / "results", "ab", log), "slurm", ["partition=small", "timeout_min=5"])

@@ -63,7 +63,7 @@ def test_keys_of_a_mapping_are_given_as_the_documents_say() -> None:
         ("env.scene_weights=[1]", "env.scene_weights is '[1]'; it is a group of settings"),
         ("env.scene_weights.hall=x", "env.scene_weights.hall is 'x'; it must be a number"),
         ("scenes={a: 1}", "scenes is '{a: 1}'; it must be "),
-        ("algorithm.updates=2.5", "algorithm.updates is '2.5'; it must be a whole number"),
+        ("algorithm.updates=2.5", "algorithm.updates is 2.5; it must be a whole number"),
         ("algorithm=" + "x" * 3000, "algorithm=xxx"),
     ],
 )

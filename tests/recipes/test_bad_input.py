@@ -106,7 +106,7 @@ def test_an_unknown_scene(run):
         ("collector.num_envs=many", "collector.num_envs is 'many'; it must be a whole number"),
         (
             "collector.kind=multi",
-            "collector.kind is 'multi'; it must be one of single, multi_sync, multi_async, hogwild",
+            "collector.kind is 'multi'; it must be one of single, multi_sync, multi_async, ray, hogwild",
         ),
         ("logger.kinds=[cvs]", "logger.kinds holds 'cvs'"),
         ("objective.gamma=1.5", "objective: USFEstimator: gamma is 1.5"),
@@ -116,7 +116,7 @@ def test_an_unknown_scene(run):
         ),
         ("agent.memory=gru", "memory is 'gru'"),
         ("device=gpu", "device is 'gpu'"),
-        ("threads=0", "threads is 0; give 1 or more"),
+        ("threads=0", "threads is 0; give 1 to 1,024"),
         ("+objective.foo=1", "no setting is called 'objective.foo'"),
         ("+foo=1", "no setting is called 'foo'"),
         ("++agnt.model=gvf", "no setting is called 'agnt.model'; did you mean 'agent.model'?"),

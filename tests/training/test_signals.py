@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+from functools import partial
 
 import pytest
 
@@ -13,7 +14,10 @@ from vusfa.training import StopOnSignal
 @pytest.mark.parametrize(
     ("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGHUP, 129)]
 )
-def test_the_first_is_noted(number: int, code: int):
+def test_the_first_is_noted(number: int, code: int, request: pytest.FixtureRequest):
+    # under nohup, hangups are ignored from the beginning
+    request.addfinalizer(partial(signal.signal, signal.SIGHUP, signal.getsignal(signal.SIGHUP)))
+    signal.signal(signal.SIGHUP, signal.SIG_DFL)
     numbers = signal.SIGINT, signal.SIGTERM, signal.SIGHUP
     before = [signal.getsignal(each) for each in numbers]
     with StopOnSignal() as stop:

@@ -278,7 +278,9 @@ def load_collector_state(
             f"the checkpoint holds {brief(state.get('batch_size'))} environments, the collector"
             f" {own['batch_size']}; leave collector.num_envs as it was"
         )
-    known = own["carrier"]  # a collector that has not begun has no action there yet
+    known = own["carrier"]
+    for name in sorted(known.keys() - state["carrier"].keys() - {"action"}):  # which comes with a step
+        raise mended(path, f"its entry 'collector.carrier.{name}' is missing")
     begun = {
         **state,
         "carrier": {**known, **{k: v for k, v in state.get("carrier", {}).items() if k in known}},
