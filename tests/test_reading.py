@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import io
 import os
+import struct
+import tracemalloc
 import zipfile
 from pathlib import Path
 from typing import Any
@@ -71,6 +73,23 @@ def test_arrays_that_swell(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> N
         read_npz(path)
 
 
+@pytest.mark.parametrize("shape", ["(3,)", "(1048576,)"])
+def test_members_longer_than_the_archive_says(tmp_path: Path, shape: str) -> None:
+    """No more is decompressed than is declared: 8 MB here, whatever is in the file."""
+    content = npy(np.zeros(1 << 20))
+    path = npz(tmp_path / "m.npz", a=npy(np.zeros(3), ("(3,)", shape))[:-24] + content)
+    size = struct.pack("<I", len(content) + 128)
+    assert path.read_bytes().count(size) == 2  # of the member, and of the list of contents
+    path.write_bytes(path.read_bytes().replace(size, struct.pack("<I", 152)))
+    tracemalloc.start()
+    try:
+        with pytest.raises(ResultError, match=r"m\.npz: cannot be read \("):
+            read_npz(path)
+        assert tracemalloc.get_traced_memory()[1] < 1 << 22
+    finally:
+        tracemalloc.stop()
+
+
 def test_archives_with_a_long_list_or_another_compression(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -96,12 +115,19 @@ def test_archives_with_a_long_list_or_another_compression(
         pytest.param("a: 2001-99-99", "cannot be read as YAML", id="date"),
         pytest.param("a: 0x_", "cannot be read as YAML", id="number"),
         pytest.param("a: \x00", "cannot be read as YAML", id="control character"),
+        pytest.param("a: [1", "expected ',' or ']'", id="not closed"),
+        pytest.param("a: 1\nb: 2\na: 3", "has the key 'a' twice", id="key twice"),
+        pytest.param("a: {b: {1: x, 1: y}}", "has the key '1' twice", id="key twice, deeper"),
+        pytest.param(
+            "".join(f"k{n}: 1\n" for n in range(8000)) + "k7: 2", "'k7' twice", id="key twice, late"
+        ),
     ],
 )
 def test_yaml_beyond_its_limits(text: str, fault: str) -> None:
     with pytest.raises(ConfigError, match=rf"x\.yaml: .*{fault}") as caught:
         parse_yaml(text, "x.yaml", ConfigError, MEND)
     assert len(str(caught.value)) < 1000
+    assert len(str(caught.value).splitlines()) == 1
 
 
 def test_aliases_within_the_limits_are_read() -> None:

@@ -10,6 +10,7 @@ import os
 import zipfile
 import zlib
 from array import array
+from collections import Counter
 from collections.abc import Collection, Iterable, Mapping
 from typing import Any, BinaryIO
 
@@ -61,8 +62,6 @@ def read_text(
     try:
         with open_regular(path, most) as file:
             return file.read().decode(encoding)
-    except FileNotFoundError as fault:
-        raise error(f"{path}: cannot be read (there is no such file); {mend}") from fault
     except (OSError, UnicodeDecodeError) as fault:
         raise error(f"{path}: cannot be read ({fault}); {mend}") from fault
 
@@ -73,7 +72,9 @@ def open_regular(path: str | os.PathLike[str], most: int | None = None) -> Binar
     Raises:
         OSError: it is none, has more bytes, or cannot be read.
     """
-    if os.path.exists(path) and not os.path.isfile(path):
+    if not os.path.exists(path):
+        raise FileNotFoundError("there is no such file")
+    if not os.path.isfile(path):
         raise OSError("it is no regular file")
     file = open(path, "rb")  # noqa: SIM115
     if most is not None and os.fstat(file.fileno()).st_size > most:
@@ -93,17 +94,22 @@ def parse_yaml(text: str, source: str, error: type[VusfaError], mend: str) -> An
     >>> from vusfa.errors import ConfigError
     >>> parse_yaml("hall: [3, 4]", "goals.yaml", ConfigError, "correct it")
     {'hall': [3, 4]}
-    >>> parse_yaml("&hall [*hall]", "goals.yaml", ConfigError, "correct it")
-    Traceback (most recent call last):
-    ...
-    vusfa.errors.ConfigError: goals.yaml: cannot be read as YAML (an alias repeats itself); correct it
     """
-    loader: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
     try:
-        _check_yaml(yaml.parse(text, Loader=loader))
-        return yaml.load(text, loader)
+        _check_yaml(yaml.parse(text, Loader=_Loader))
+        return yaml.load(text, _Loader)
     except (yaml.YAMLError, *_PARSING) as fault:
-        raise error(f"{source}: cannot be read as YAML ({fault}); {mend}") from fault
+        raise error(f"{source}: cannot be read as YAML ({' '.join(str(fault).split())}); {mend}") from fault
+
+
+class _Loader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # type: ignore[misc]
+    def construct_mapping(self, node: Any, deep: bool = False) -> Any:
+        """Refuse a key that is given twice; the last one would count."""
+        keys = [(key.tag, key.value) for key, _ in node.value if isinstance(key, yaml.ScalarNode)]
+        if len(set(keys)) < len(keys):
+            twice = next(key for key, times in Counter(keys).items() if times > 1)
+            raise ValueError(f"it has the key {brief(twice[1])} twice")
+        return super().construct_mapping(node, deep)
 
 
 def _check_yaml(events: Iterable[yaml.Event]) -> None:
@@ -187,17 +193,14 @@ def read_csv(
             numbers, shared = array("d"), dict[str, str]()
             for fields in reader:
                 row += 1
-                if len(fields) != len(names):
-                    if len(fields) > len(names):
-                        raise ValueError(f"{len(fields)} fields, and {len(names)} columns")
-                    fields += [""] * (len(names) - len(fields))
+                if len(fields) > len(names):
+                    raise ValueError(f"{len(fields)} fields, and {len(names)} columns")
+                fields += [""] * (len(names) - len(fields))
                 numbers.extend([float(x) if x else math.nan for k, x in enumerate(fields) if k not in texts])
                 for place, column in texts.items():
                     column.append(shared.setdefault(fields[place], fields[place]))
                 if len(shared) > limits.MAX_CSV_WORDS:
                     raise ValueError(f"more than {limits.MAX_CSV_WORDS} different words")
-    except FileNotFoundError as fault:
-        raise error(f"{path}: cannot be read (there is no such file); {mend}") from fault
     except OSError as fault:
         raise error(f"{path}: cannot be read ({fault}); {mend}") from fault
     except (csv.Error, ValueError) as fault:
@@ -259,14 +262,13 @@ def read_npz(path: str | os.PathLike[str]) -> dict[str, np.ndarray]:
         if sum(array.size for array in arrays.values()) > limits.MAX_NPZ_ELEMENTS:
             raise ValueError(f"its arrays have more than {limits.MAX_NPZ_ELEMENTS} elements")
         return arrays
-    except FileNotFoundError as error:
-        raise ResultError(f"{path}: cannot be read (there is no such file); make it again") from error
     except (OSError, EOFError, zipfile.BadZipFile, zlib.error, RuntimeError, *_PARSING) as error:
         raise ResultError(f"{path}: cannot be read ({error}); make it again") from error
 
 
 def _array(file: zipfile.ZipFile, info: zipfile.ZipInfo) -> np.ndarray:
-    content = io.BytesIO(file.read(info))
+    with file.open(info) as member:  # ZipFile.read decompresses all that there is, whatever is declared
+        content = io.BytesIO(member.read(info.file_size + 1))
     try:
         return _read_array(content, info.file_size)
     except ValueError as error:
@@ -285,8 +287,7 @@ def _read_array(file: BinaryIO, size: int) -> np.ndarray:
     sound = dtype.kind in "biufU" and all(type(side) is int and side >= 0 for side in shape)
     if not sound or dtype.itemsize * math.prod(shape) != held:
         raise ValueError(f"declares {dtype} of shape {brief(shape)}, and holds {held} bytes")
-    flat = np.frombuffer(file.read(held), dtype)
-    return flat.reshape(shape, order="F" if column_major else "C").copy()
+    return np.frombuffer(file.read(held), dtype).reshape(shape, order="F" if column_major else "C").copy()
 
 
 def read_npy(path: str | os.PathLike[str], error: type[VusfaError], mend: str) -> np.ndarray:
@@ -294,7 +295,5 @@ def read_npy(path: str | os.PathLike[str], error: type[VusfaError], mend: str) -
     try:
         with open_regular(path) as file:
             return _read_array(file, os.fstat(file.fileno()).st_size)
-    except FileNotFoundError as fault:
-        raise error(f"{path}: cannot be read (there is no such file); {mend}") from fault
     except (OSError, ValueError) as fault:
         raise error(f"{path}: cannot be read ({fault}); {mend}") from fault

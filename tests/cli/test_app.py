@@ -62,6 +62,22 @@ def test_errors_of_the_program_are_not_hidden(
     assert isinstance(run("check", "x.h5").exception, ZeroDivisionError)
 
 
+@pytest.mark.parametrize(
+    "arguments", [("check",), ("compact", "-"), ("encode", "-")], ids=lambda given: given[0]
+)
+@pytest.mark.parametrize("name", ["a" * 5000, "file/x.h5"])
+def test_names_that_no_file_can_have_are_one_line(
+    run: Callable[..., Any], tmp_path: Path, name: str, arguments: tuple[str, ...]
+) -> None:
+    (tmp_path / "file").touch()
+    command, *rest = arguments
+    result = run(command, tmp_path / name, *(tmp_path / "target.h5" for _ in rest))
+    assert result.exit_code == 1
+    assert result.stderr.startswith("error: ")
+    assert result.stderr.count("\n") == 1
+    assert len(result.stderr) < 1000 or "file/x.h5" in name
+
+
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
 def test_a_signal_ends_a_process_that_cleans_up(
     number: signal.Signals, code: int, program: Callable[..., Any], tmp_path: Path

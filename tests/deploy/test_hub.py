@@ -152,6 +152,69 @@ def test_what_is_not_there_or_is_no_agent_is_one_error(hub: Hub, tmp_path: Path)
         HubAgent.from_pretrained("someone/else")
 
 
+ANSWERS = {
+    "circle": (302, {"Location": "/someone/liar/resolve/main/agent.safetensors"}),
+    "to a file": (302, {"Location": "file:///etc/passwd"}),
+    "commit that climbs": (200, {"ETag": '"a"', "X_Repo_Commit": "../../../../evil"}),
+    "terabytes": (200, {"ETag": '"a"', "X_Repo_Commit": COMMIT, "Content_Length": str(10**13)}),
+    "refusal": (403, {}),
+}
+
+
+@pytest.mark.parametrize("lie", ANSWERS)
+def test_whatever_a_hub_answers_is_one_line(hub: Hub, monkeypatch: pytest.MonkeyPatch, lie: str) -> None:
+    def answer(handler: Handler) -> None:
+        status, headers = ANSWERS[lie]
+        handler.send_response(status)
+        for name, value in {"Content_Length": "0", **headers}.items():
+            handler.send_header(name.replace("_", "-"), value)
+        handler.end_headers()
+
+    monkeypatch.setattr(Handler, "do_GET", answer)
+    monkeypatch.setattr(Handler, "do_HEAD", answer)
+    with pytest.raises(CheckpointError, match=r"^someone/liar: cannot be fetched \(") as caught:
+        HubAgent.from_pretrained("someone/liar")
+    assert len(str(caught.value).splitlines()) == 1
+    assert len(str(caught.value)) < 500
+
+
+@pytest.mark.parametrize("name", ["a/b/c", "../x", "", "-x", "x" * 5000])
+def test_names_that_no_repository_has(hub: Hub, name: str) -> None:
+    with pytest.raises(CheckpointError, match=r"cannot be fetched|no such file"):
+        HubAgent.from_pretrained(name)
+    assert hub.asked == []
+
+
+def test_without_a_connection_it_is_not_called_no_agent(hub: Hub) -> None:
+    with pytest.raises(CheckpointError, match=r"cannot be fetched \(agent\.safetensors: "):
+        HubAgent.from_pretrained("someone/walker", local_files_only=True)
+
+
+@pytest.mark.parametrize("content", [b"{", b"[1]", b"[" * 100_000, b'{"a": "\xe9"}'])
+def test_a_config_that_agents_do_not_have_is_not_read(
+    hub: Hub, trained: HubAgent, tmp_path: Path, content: bytes
+) -> None:
+    trained.save_pretrained(tmp_path)
+    (tmp_path / "config.json").write_bytes(content)
+    scenes = trained.trained.scenes
+    assert HubAgent.from_pretrained(tmp_path, scenes=scenes).trained.agent.config["model"] == "sfdp"
+    for path in tmp_path.iterdir():
+        hub.files["someone/walker", path.name] = path.read_bytes()
+    HubAgent.from_pretrained("someone/walker", scenes=scenes)
+    assert not any("config.json" in path for path in hub.asked)
+
+
+def test_model_cards_that_are_missing_or_no_text(hub: Hub, trained: HubAgent, tmp_path: Path) -> None:
+    trained.save_pretrained(tmp_path)
+    scenes, card = trained.trained.scenes, tmp_path / "README.md"
+    hub.files["someone/walker", "agent.safetensors"] = (tmp_path / "agent.safetensors").read_bytes()
+    assert HubAgent.from_pretrained("someone/walker", scenes=scenes).trained.card == ""
+    for content, fault in [(b"caf\xe9", "utf-8"), (b"x" * (1 << 21), "more than 1048576 bytes")]:
+        card.write_bytes(content)
+        with pytest.raises(CheckpointError, match=rf"README\.md: cannot be read \(.*{fault}"):
+            HubAgent.from_pretrained(tmp_path, scenes=scenes)
+
+
 def test_an_agent_of_the_bundled_rooms_names_them_and_no_path(tmp_path: Path) -> None:
     HubAgent.open("gvf").save_pretrained(tmp_path)
     text = (tmp_path / "agent.safetensors").read_bytes()[:4000].decode("latin1")

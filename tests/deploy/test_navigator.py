@@ -164,7 +164,7 @@ def test_faults_are_one_clear_error(world: Any, tmp_path: Path, stranger: Any) -
     (tmp_path / "goal.jpg").write_bytes(b"no picture")
     with pytest.raises(SceneError, match=r"goal.jpg: is no picture that can be read \(unknown format\)"):
         navigator.goal(tmp_path / "goal.jpg")
-    with pytest.raises(SceneError, match=r"none.jpg: cannot be read \(No such file or directory\)"):
+    with pytest.raises(SceneError, match=r"none.jpg: cannot be read \(there is no such file\)"):
         navigator.goal(tmp_path / "none.jpg")
 
 

@@ -18,7 +18,7 @@ from vusfa.cli.app import app
 from vusfa.deploy import Navigator, open_agent, pretrained_names
 from vusfa.deploy.agents import PRETRAINED, read_agent, rounded, save_agent
 from vusfa.deploy.cards import TOLERANCE, card_head, make_pretrained, write_log
-from vusfa.errors import CheckpointError, ConfigError, ResultError
+from vusfa.errors import CheckpointError, ConfigError, ResultError, SceneError
 from vusfa.evaluation import Episodes
 from vusfa.evaluation.exact import exact_goals, expected_walks
 from vusfa.experiments.runs import Run, write_run
@@ -225,6 +225,13 @@ def test_damaged_files_and_files_of_others_are_one_error(world: Any, tmp_path: P
         read_agent(
             written(scenes={"sources": [], "names": ["hall", "attic"], "fingerprint": "0"}), world.scenes
         )
+    hall = str(world.files[0])
+    for sources, fault in [
+        ([hall] * 100_000, r"100000 scenes are called '\w+', of one file; name it once"),
+        (["bathroom", "./../" + "a" * 5000], r"there is no such file"),
+    ]:
+        with pytest.raises(SceneError, match=fault):
+            read_agent(written(scenes={"sources": sources, "names": ["hall", "attic"], "fingerprint": "0"}))
     weights["fusion.linear.bias"][0] = torch.nan
     with pytest.raises(CheckpointError, match="its weights hold NaN or infinity"):
         read_agent(written())

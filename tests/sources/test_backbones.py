@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+import zipfile
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
 from typing import Any
@@ -289,6 +290,25 @@ def test_weights_that_would_run_code_are_refused(tmp_path: Path, torchvision: No
     with pytest.raises(ConfigError, match="are no weights"):
         load_backbone("torchvision:tiny", weights=tmp_path / "trap.pth")
     assert not (tmp_path / "sprung").exists()
+
+
+@pytest.mark.parametrize("content", ["zip", "weights"])
+def test_weights_that_swell_are_refused(
+    tmp_path: Path, torchvision: None, content: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    torch.save({"weight": torch.zeros(1 << 20)}, tmp_path / "plain.pth")
+    with zipfile.ZipFile(tmp_path / "plain.pth") as plain:
+        inside = (
+            {name: plain.read(name) for name in plain.namelist()}
+            if content == "weights"
+            else {"x": bytes(1 << 22)}
+        )
+    with zipfile.ZipFile(tmp_path / "bomb.pth", "w", zipfile.ZIP_DEFLATED) as bomb:
+        for name, values in inside.items():
+            bomb.writestr(name, values)
+    monkeypatch.setattr(torch, "load", lambda *given, **options: pytest.fail("was read"))
+    with pytest.raises(ConfigError, match=r"bomb\.pth: are no weights .*records are longer than the file"):
+        load_backbone("torchvision:tiny", weights=tmp_path / "bomb.pth")
 
 
 @pytest.mark.parametrize("answer", [torch.zeros(2, 3, 4), torch.zeros(1, 3), {"out": 1}])

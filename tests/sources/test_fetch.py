@@ -250,7 +250,10 @@ def test_a_refusal_is_not_repeated(serve: Callable, tmp_path: Path, status: str)
     assert len(server.asked) == 1
 
 
-@pytest.mark.parametrize("url", ["no-scheme", "gopher://127.0.0.1/x"])
+@pytest.mark.parametrize(
+    "url",
+    ["no-scheme", "gopher://127.0.0.1/x", "http://" + "a" * 300 + ".com/x", "http://a..b/x", "http://[::1/x"],
+)
 def test_what_is_no_address_is_said_at_once(tmp_path: Path, url: str) -> None:
     with pytest.raises(SceneError, match="is no address"):
         download(url, tmp_path / "f", QUICK, sleep=lambda seconds: pytest.fail("waited"))
@@ -408,7 +411,7 @@ def test_what_does_not_pass_is_not_let_in(
         "graph": r"bathroom_02.h5 dataset 'graph', state 2: action 0 leads to 17",
         "distance": r"state 0 to state 1: 2, but by the graph it is 1",
         "missing": r"has no bathroom_02.h5",
-        "no zip": r"is no whole zip file",
+        "no zip": r"the file begins with b'<html>moved</htm', not with b'PK'",
     }
     out = tmp_path / "out"
     out.mkdir()
@@ -417,6 +420,24 @@ def test_what_does_not_pass_is_not_let_in(
         fetch(described(server.url, states=6 if trouble == "count" else 5), out)
     assert names(out) == ["kitchen_02.h5"]  # neither scenes nor archive nor parts
     assert (out / "kitchen_02.h5").read_bytes() == b"older"
+
+
+def test_what_is_no_archive_goes_with_its_first_block(serve: Callable, tmp_path: Path) -> None:
+    server = serve(b"")
+    server.mood = ["endless"]
+    with pytest.raises(SceneError, match=r"the file begins with b'x*', not with b'PK'"):
+        fetch(described(server.url), tmp_path / "out")
+    assert names(tmp_path / "out") == []
+
+
+@pytest.mark.parametrize("url", ["http://a/\r\nX: y", "http://a/\x1b[2J", "http://a/" + "a" * 3000])
+def test_mirrors_with_what_no_address_has(tmp_path: Path, url: str) -> None:
+    with pytest.raises(
+        ConfigError, match=r"thor-v1: mirror 'http://a/.*' is no address; correct it$"
+    ) as caught:
+        fetch(described(url), tmp_path / "out")
+    assert caught.value.args[0].isprintable()
+    assert not (tmp_path / "out").exists()
 
 
 def test_an_archive_that_lies_here_is_used_and_replaced_when_it_is_bad(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 from importlib import import_module
 from typing import Annotated, Any
 
@@ -12,8 +13,12 @@ from vusfa import __version__
 from vusfa.cli import COMMANDS, FIRST_STEPS, FUNCTIONS, TRAINING_COMMANDS
 from vusfa.cli.functions import App, forward
 from vusfa.errors import VusfaError
+from vusfa.limits import brief
 
 __all__ = ["app", "scenes"]
+
+#: What the system answers to a name that no file can have, or that leads nowhere.
+_WRONG_NAMES = (errno.ENAMETOOLONG, errno.ELOOP, errno.ENOTDIR)
 
 
 class _Commands(TyperGroup):
@@ -25,6 +30,11 @@ class _Commands(TyperGroup):
             return super().invoke(ctx)
         except VusfaError as error:
             typer.echo(f"error: {error}", err=True)
+            raise typer.Exit(1) from error
+        except OSError as error:
+            if error.errno not in _WRONG_NAMES or error.filename is None:
+                raise
+            typer.echo(f"error: {brief(str(error.filename))}: {error.strerror}; check the path", err=True)
             raise typer.Exit(1) from error
         except KeyboardInterrupt as interrupt:
             typer.echo("stopped", err=True)

@@ -28,7 +28,7 @@ from vusfa.scenes.store import bundled_path
 from vusfa.training import load_agent
 from vusfa.training.checkpoint import saved_agent
 from vusfa.training.content import check_sizes
-from vusfa.training.scene_files import find_source, scene_sources
+from vusfa.training.scene_files import find_sources, scene_sources
 
 __all__ = [
     "PRETRAINED",
@@ -220,7 +220,7 @@ def read_agent(path: str | os.PathLike[str], scenes: SceneSet | None = None) -> 
         ) from error
     check_sizes(path, header["agent_config"], weights)
     if scenes is None:
-        scenes = SceneSet.open([find_source(source, path) for source in header["scenes"]["sources"]])
+        scenes = SceneSet.open(find_sources(header["scenes"]["sources"], path))
     agent = saved_agent(path, {**header, "agent": weights, "goals": goals}, scenes)
     return TrainedAgent(agent, scenes, goals)
 

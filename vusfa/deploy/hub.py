@@ -6,16 +6,19 @@ repository holds ``agent.safetensors`` (:mod:`vusfa.deploy.agents`) and the mode
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import Any
 
 from vusfa.deploy.agents import TrainedAgent, open_agent, read_agent, save_agent
 from vusfa.errors import CheckpointError, ConfigError, SceneError
+from vusfa.limits import brief
+from vusfa.reading import read_text
 from vusfa.scenes import SceneSet
 
 try:
     from huggingface_hub import ModelHubMixin, hf_hub_download
-    from huggingface_hub.errors import EntryNotFoundError, HfHubHTTPError, LocalEntryNotFoundError
+    from huggingface_hub.errors import EntryNotFoundError, LocalEntryNotFoundError
 except ModuleNotFoundError as error:
     raise ConfigError("model hubs need huggingface_hub: pip install 'vusfa[hub]'") from error
 
@@ -60,26 +63,49 @@ class HubAgent(ModelHubMixin, library_name="vusfa"):
         (save_directory / _CARD).write_text(card or _PLAIN_CARD, encoding="utf-8")
 
     @classmethod
-    def _from_pretrained(cls, *, model_id: str, scenes: SceneSet | None = None, **options: Any) -> HubAgent:
-        folder = Path(model_id)
-        if folder.is_dir():
-            path, card = folder / _FILE, folder / _CARD
-        else:
-            kept = {
-                key: options[key]
-                for key in ("revision", "cache_dir", "force_download", "token", "local_files_only")
-            }
-            try:
-                path, card = (Path(hf_hub_download(model_id, name, **kept)) for name in (_FILE, _CARD))
-            except EntryNotFoundError as error:
-                raise CheckpointError(f"{model_id}: has no {_FILE}; it is no agent of vusfa") from error
-            except (HfHubHTTPError, LocalEntryNotFoundError, OSError) as error:
-                reason = str(error).strip().splitlines()[0]
-                raise CheckpointError(f"{model_id}: cannot be fetched ({reason}); check its name") from error
+    def from_pretrained(  # type: ignore[override]
+        cls, source: str | Path, *, scenes: SceneSet | None = None, **options: Any
+    ) -> HubAgent:
+        """Load an agent from a hub or from a folder of ``save_pretrained``.
+
+        The mixin's own method would read a ``config.json`` first, which agents do not have.
+
+        Args:
+            source: ``OWNER/NAME`` on the hub, or a folder.
+            scenes: the rooms that the agent was trained in, when they are not bundled.
+            options: of ``huggingface_hub.hf_hub_download``: ``revision``, ``cache_dir``, ``force_download``,
+                ``token``, ``local_files_only``.
+
+        Raises:
+            CheckpointError: there is no such agent, it cannot be fetched, or a file is damaged.
+            SceneError: its rooms are not here.
+        """
+        path, card = (
+            Path(source, name) if os.path.isdir(source) else _fetched(str(source), name, options)
+            for name in (_FILE, _CARD)
+        )
+        if path is None:
+            raise CheckpointError(f"{source}: has no {_FILE}; it is no agent of vusfa")
         try:
             found = read_agent(path, scenes)
         except SceneError as error:
             raise SceneError(
                 f"{error}; a hub has no rooms: give them as scenes=SceneSet.open(...)"
             ) from error
-        return cls(found._replace(card=card.read_text(encoding="utf-8") if card.is_file() else ""))
+        if card is None or not card.is_file():
+            return cls(found)
+        text = read_text(card, CheckpointError, "write the model card again as UTF-8, or remove it")
+        return cls(found._replace(card=text))
+
+
+def _fetched(source: str, name: str, options: dict[str, Any]) -> Path | None:
+    """A file of a repository in the cache; None when the repository is there without it."""
+    try:
+        return Path(hf_hub_download(source, name, **options))
+    except Exception as error:  # whatever a server says and the library makes of it
+        if isinstance(error, EntryNotFoundError) and not isinstance(error, LocalEntryNotFoundError):
+            return None
+        reason = brief(" ".join(str(error).split()) or type(error).__name__)
+        raise CheckpointError(
+            f"{source[:200]}: cannot be fetched ({name}: {reason}); check its name and the connection"
+        ) from error

@@ -44,7 +44,7 @@ def opened(path: Path) -> Iterator[h5py.File]:
     Raises:
         SceneError: the file is missing, locked, unreadable, truncated, damaged, or no HDF5 file.
     """
-    if not path.exists() or path.is_dir():
+    if not os.path.exists(path) or path.is_dir():
         raise SceneError(f"{path}: there is no such file; check the path")
     if not path.is_file():
         raise SceneError(f"{path}: is no regular file; check the path")

@@ -21,6 +21,7 @@ their SHA-256 is :data:`LITE0_SHA256`.
 from __future__ import annotations
 
 import os
+import zipfile
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from importlib import import_module
@@ -31,6 +32,8 @@ import torch
 from torch import Tensor, nn
 
 from vusfa.errors import ConfigError
+from vusfa.limits import brief
+from vusfa.reading import BoundedZip
 from vusfa.sources.crops import Preprocessing
 from vusfa.sources.layers import Features, Patches, UpTo
 from vusfa.sources.row_log import file_sha256
@@ -193,6 +196,7 @@ def _load_weights(network: nn.Module, path: Path, wanted_by: str) -> None:
         if path.suffix == ".safetensors":
             state = _package("safetensors.torch", wanted_by, "safetensors").load_file(path)
         else:
+            _check_records(path)
             state = torch.load(path, map_location="cpu", weights_only=True)
         if isinstance(state, Mapping):
             state = next((state[key] for key in ("state_dict", "model") if key in state), state)
@@ -200,7 +204,16 @@ def _load_weights(network: nn.Module, path: Path, wanted_by: str) -> None:
     except ConfigError:
         raise
     except Exception as error:  # a damaged file may raise anything
-        raise ConfigError(f"{path}: are no weights of {wanted_by} ({error}); give its state dict") from error
+        reason = brief(" ".join(str(error).split()))
+        raise ConfigError(f"{path}: are no weights of {wanted_by} ({reason}); give its state dict") from error
+
+
+def _check_records(path: Path) -> None:
+    """Refuse an archive whose records are longer than they are stored; torch.save does not compress."""
+    if zipfile.is_zipfile(path):
+        with BoundedZip(path) as archive:
+            if sum(record.file_size for record in archive.infolist()) > path.stat().st_size:
+                raise ValueError("its records are longer than the file")
 
 
 def _lite0(path: Path | None) -> Backbone:

@@ -20,7 +20,7 @@ from typing import Any
 from urllib.parse import urljoin
 
 from vusfa.errors import ConfigError, SceneError
-from vusfa.limits import FREE_BYTES, MAX_ARCHIVE_BYTES
+from vusfa.limits import FREE_BYTES, MAX_ARCHIVE_BYTES, brief
 from vusfa.reading import read_json
 
 __all__ = ["Patience", "download", "require_space"]
@@ -54,6 +54,7 @@ def download(
     patience: Patience,
     progress: Callable[[int, int], None] | None = None,
     sleep: Callable[[float], None] = time.sleep,
+    begins: bytes = b"",
 ) -> None:
     """Download a file, resuming an earlier attempt; the target appears when it is complete.
 
@@ -63,6 +64,7 @@ def download(
         patience: when to try again, and when to give up.
         progress: called with bytes received and bytes in total (0 when the server does not say).
         sleep: waits between two tries.
+        begins: first bytes of every such file; what begins otherwise is refused with its first block.
 
     Raises:
         SceneError: nothing new came in ``patience.attempts`` tries, or the server refuses; what has arrived
@@ -74,14 +76,14 @@ def download(
     while True:
         before = part.size
         try:
-            _transfer(requests, url, part, patience, progress or (lambda done, total: None))
+            _transfer(requests, url, part, patience, progress or (lambda done, total: None), begins)
             part.finish()
             return
         except _Refused as refusal:
             raise SceneError(f"{url}: {refusal}; give another mirror") from refusal
-        except _never(requests) as error:
-            raise SceneError(f"{url}: is no address ({error}); give one like http://host/file.zip") from error
         except requests.RequestException as error:
+            if isinstance(error, ValueError):
+                raise _no_address(url, error) from error
             # A transfer that breaks off after every few megabytes still gets there.
             failures = 1 if part.size >= before + _PROGRESS else failures + 1
             if failures >= patience.attempts:
@@ -90,13 +92,14 @@ def download(
                     f" what has come is kept, or give another mirror"
                 ) from error
             sleep(patience.pause * 2 ** (failures - 1))
+        except ValueError as error:  # urllib3 about a name of a host
+            raise _no_address(url, error) from error
         except OSError as error:
             raise SceneError(f"{part.path}: cannot be written ({error}); check space and rights") from error
 
 
-def _never(requests: Any) -> tuple[type[Exception], ...]:
-    wrong = requests.exceptions
-    return (wrong.InvalidURL, wrong.MissingSchema, wrong.InvalidSchema)
+def _no_address(url: str, error: Exception) -> SceneError:
+    return SceneError(f"{url}: is no address ({brief(str(error))}); give one like http://host/file.zip")
 
 
 class _Refused(Exception):
@@ -142,7 +145,12 @@ class _Part:
 
 
 def _transfer(
-    requests: Any, url: str, part: _Part, patience: Patience, progress: Callable[[int, int], None]
+    requests: Any,
+    url: str,
+    part: _Part,
+    patience: Patience,
+    progress: Callable[[int, int], None],
+    begins: bytes,
 ) -> None:
     """One connection: request what is missing, write it as it arrives.
 
@@ -176,6 +184,9 @@ def _transfer(
         progress(done, total)
         with open(part.path, "ab") as file:
             for number, block in enumerate(stream):
+                if done == 0 and block[: len(begins)] != begins[: len(block)]:
+                    part.discard()
+                    raise _Refused(f"the file begins with {brief(block[:16])}, not with {begins!r}")
                 file.write(block)
                 done += len(block)
                 if max(done, total) > MAX_ARCHIVE_BYTES:

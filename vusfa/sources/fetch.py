@@ -142,8 +142,12 @@ def fetch(
 
     Raises:
         SceneError: no mirror gave an archive that passes; the message says what each one did.
+        ConfigError: a mirror is no address.
     """
     folder, report = Path(folder), say or (lambda line: None)
+    for url in mirrors or archive.mirrors:
+        if not url.isprintable() or len(url) > 2000:
+            raise ConfigError(f"{archive.name}: mirror {brief(url)} is no address; correct it")
     targets = {name: folder / f"{name}.h5" for name in archive.scenes}
     if all(t.exists() and not arrived_faults(t, archive.scenes[n]) for n, t in targets.items()):
         report(f"{folder}: all scenes are there and sound")
@@ -160,7 +164,7 @@ def fetch(
             try:
                 if not packed.exists():
                     report(f"fetching {url}")
-                    download(url, packed, archive.patience, progress, sleep)
+                    download(url, packed, archive.patience, progress, sleep, begins=b"PK")
                     attempt = "fetched"
                 report(f"unpacking and checking {packed.name}")
                 _admit(packed, archive, targets)

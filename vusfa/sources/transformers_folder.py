@@ -15,6 +15,7 @@ from typing import Any
 from torch import Tensor, nn
 
 from vusfa.errors import ConfigError
+from vusfa.limits import MAX_PICTURE_SIDE
 from vusfa.reading import read_json
 from vusfa.sources.crops import Preprocessing
 from vusfa.sources.row_log import file_sha256
@@ -127,6 +128,8 @@ def _preprocessing(folder: Path, config: Any) -> Preprocessing:
         resized = _side(given.get("size"), own)
         cut = given.get("do_center_crop", False)
         size = _side(given.get("crop_size"), resized) if cut else resized
+        if not all(0 < side <= MAX_PICTURE_SIDE for side in (size, resized)):
+            raise ValueError(f"pictures of {size} and {resized} pixels; at most {MAX_PICTURE_SIDE} are made")
         return Preprocessing(
             size=size,
             crops="centre",

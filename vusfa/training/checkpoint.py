@@ -44,7 +44,7 @@ from vusfa.limits import brief, listing
 from vusfa.modules import Agent, make_agent
 from vusfa.scenes import SceneSet
 from vusfa.training.content import NO_VALIDATION, check_entries, check_like, mended, read_content
-from vusfa.training.scene_files import find_given, find_source, with_goals
+from vusfa.training.scene_files import find_given, find_sources, with_goals
 from vusfa.training.upgrade import upgrade
 
 __all__ = [
@@ -130,7 +130,7 @@ def load_checkpoint(path: str | Path, device: torch.device | str = "cpu") -> dic
         )
     state.setdefault("validation", dict(NO_VALIDATION))
     check_entries(path, state)
-    state["scenes"]["sources"] = [find_source(source, path) for source in state["scenes"]["sources"]]
+    state["scenes"]["sources"] = find_sources(state["scenes"]["sources"], path)
     state["config"] = with_goals(state["config"], lambda source: find_given(source, path))
     return state
 

@@ -13,7 +13,7 @@ from vusfa.scenes import bundled_names
 
 __all__ = [
     "find_given",
-    "find_source",
+    "find_sources",
     "scene_sources",
     "settings_seen_from",
     "with_goals",
@@ -34,20 +34,22 @@ def scene_sources(scenes: str | Sequence[str], folder: str | Path) -> list[str]:
     ]
 
 
-def find_source(source: str, checkpoint: Path) -> str:
-    """Where a checkpoint's scene is now: where it was, seen from the checkpoint, or else beside that."""
-    folder = Path(os.path.realpath(checkpoint)).parent
-    if source in bundled_names() or not source:
-        return source
-    place = Path(os.path.normpath(folder / source))
-    beside = folder / place.name
-    return str(beside if beside.is_file() and not place.exists() else place)
+def find_sources(sources: Sequence[str], checkpoint: Path) -> list[str]:
+    """Where a checkpoint's scenes are now: where they were, seen from the checkpoint, or else beside that."""
+    folder, bundled = os.path.dirname(os.path.realpath(checkpoint)), bundled_names()
+    found = []
+    for source in sources:
+        place = os.path.normpath(os.path.join(folder, source))
+        beside = os.path.join(folder, os.path.basename(place))
+        moved = os.path.isfile(beside) and not os.path.exists(place)
+        found.append(source if source in bundled or not source else beside if moved else place)
+    return found
 
 
 def find_given(source: str, checkpoint: Path) -> str:
-    """As :func:`find_source`; what is not there stays as it is, as version 0.1 wrote it."""
-    found = find_source(source, checkpoint)
-    return found if Path(found).is_file() else source
+    """As :func:`find_sources`; what is not there stays as it is, as version 0.1 wrote it."""
+    (found,) = find_sources([source], checkpoint)
+    return found if os.path.isfile(found) else source
 
 
 def settings_seen_from(folder: str | Path, settings: Mapping[str, Any]) -> dict[str, Any]:
