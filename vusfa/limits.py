@@ -67,6 +67,8 @@ MAX_JSON_BYTES = 1 << 24
 MAX_CSV_BYTES, MAX_CSV_WORDS = 1 << 25, 100_000
 #: Size of a CSV file of poses or moves, which become Python's objects.
 MAX_TABLE_BYTES = 1 << 24
+#: Size of one file of a library of furniture.
+MAX_MODEL_BYTES = 1 << 28
 #: Pieces of furniture, and entries of any other kind, of a plan.
 MAX_FURNITURE = 1000
 

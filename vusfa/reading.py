@@ -53,11 +53,10 @@ def read_text(
         most: bytes.
         encoding: of the text.
 
-    >>> from vusfa.errors import ConfigError
-    >>> read_text("/dev/zero", ConfigError, "give a file")
+    >>> read_text("/dev/zero", ResultError, "give a file")
     Traceback (most recent call last):
     ...
-    vusfa.errors.ConfigError: /dev/zero: cannot be read (it is no regular file); give a file
+    vusfa.errors.ResultError: /dev/zero: cannot be read (it is no regular file); give a file
     """
     try:
         with open_regular(path, most) as file:
@@ -91,8 +90,7 @@ def read_yaml(path: str | os.PathLike[str], error: type[VusfaError], mend: str) 
 def parse_yaml(text: str, source: str, error: type[VusfaError], mend: str) -> Any:
     """Parse one YAML document without tags, of bounded depth and size; each alias counts as what it repeats.
 
-    >>> from vusfa.errors import ConfigError
-    >>> parse_yaml("hall: [3, 4]", "goals.yaml", ConfigError, "correct it")
+    >>> parse_yaml("hall: [3, 4]", "goals.yaml", ResultError, "correct it")
     {'hall': [3, 4]}
     """
     try:
@@ -158,11 +156,10 @@ def check_fields(
 ) -> None:
     """Refuse fields of a file, where it has them, that are of another type than code reads them as.
 
-    >>> from vusfa.errors import ConfigError
-    >>> check_fields({"seed": "one"}, {"seed": int}, "config.json", ConfigError, "write it again")
+    >>> check_fields({"seed": "one"}, {"seed": int}, "config.json", ResultError, "write it again")
     Traceback (most recent call last):
     ...
-    vusfa.errors.ConfigError: config.json: field 'seed' is 'one'; write it again
+    vusfa.errors.ResultError: config.json: field 'seed' is 'one'; write it again
     """
     for name, kind in kinds.items():
         value = content.get(name)
@@ -233,12 +230,16 @@ class BoundedZip(zipfile.ZipFile):
         try:
             super().__init__(opened)
             opened.reads_contents = False
-            methods = {info.compress_type for info in self.infolist()}
-            if methods - {zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED}:
+            if {info.compress_type for info in self.infolist()} - {zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED}:
                 raise zipfile.BadZipFile("it is compressed by another method than deflate")
         except BaseException:
             opened.close()
             raise
+
+    def read(self, name: str | zipfile.ZipInfo, pwd: bytes | None = None) -> bytes:
+        """A member as far as its declared size; ``ZipFile.read`` decompresses all that there is first."""
+        with self.open(name, pwd=pwd) as member:
+            return member.read((name if isinstance(name, zipfile.ZipInfo) else self.getinfo(name)).file_size)
 
     def close(self) -> None:
         """Close the archive and its file."""
@@ -267,8 +268,7 @@ def read_npz(path: str | os.PathLike[str]) -> dict[str, np.ndarray]:
 
 
 def _array(file: zipfile.ZipFile, info: zipfile.ZipInfo) -> np.ndarray:
-    with file.open(info) as member:  # ZipFile.read decompresses all that there is, whatever is declared
-        content = io.BytesIO(member.read(info.file_size + 1))
+    content = io.BytesIO(file.read(info))
     try:
         return _read_array(content, info.file_size)
     except ValueError as error:

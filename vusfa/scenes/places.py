@@ -69,9 +69,9 @@ def open_scenes(
     :meth:`vusfa.scenes.SceneSet.open`."""
     sources, opened, faults, given = [], [], [], expanded(scenes)
     lazy = len(given) >= LAZY_SCENES if lazy is None else lazy
-    source, most = max(Counter(map(os.fspath, given)).items(), key=lambda item: item[1], default=("", 1))
-    if most > 1:
-        raise SceneError(f"{most} scenes are called {brief(Path(source).stem)}, of one file; name it once")
+    for name, most in Counter(filter(None, map(os.fspath, given))).most_common(1):
+        if most > 1:
+            raise SceneError(f"{most} scenes are called {brief(Path(name).stem)}, of one file; name it once")
     for source in given:
         try:
             scene = Scene.open(source, lazy)

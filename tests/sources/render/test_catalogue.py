@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import struct
 import zipfile
 from pathlib import Path
 
@@ -29,6 +30,30 @@ def test_files_are_read_from_the_archive_whatever_their_case(boxes: Catalogue) -
     assert archive.folder("boxes/crate") == ["crate.mtl", "crate.obj", "other.png"]
     with pytest.raises(SceneError, match=r"Boxes\.sh3f: cannot give 'boxes/shelf/shelf\.obj'"):
         archive.read("boxes/shelf/shelf.obj")
+
+
+@pytest.mark.parametrize("trouble", ["swells", "damaged", "encrypted", "too large"])
+def test_a_file_that_cannot_be_read_is_one_line(
+    library: Path, trouble: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path, size = library / "Boxes.sh3f", struct.pack("<I", 1 << 20)
+    with zipfile.ZipFile(path, "a", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("boxes/big.obj", bytes(1 << 20))
+    content = path.read_bytes()
+    found = content.index(b"boxes/big.obj")
+    if trouble == "swells":
+        content = content.replace(size, struct.pack("<I", 100))
+    elif trouble == "damaged":
+        content = content[: found + 20] + b"\xff" * 20 + content[found + 40 :]
+    elif trouble == "encrypted":
+        listed = content.rindex(b"PK\x01\x02")
+        content = content[: listed + 8] + b"\x01" + content[listed + 9 :]
+    else:
+        monkeypatch.setattr("vusfa.sources.render.catalogue.MAX_MODEL_BYTES", 1000)
+    path.write_bytes(content)
+    catalogue = Catalogue.open(library)
+    with pytest.raises(SceneError, match=r"Boxes\.sh3f: cannot give 'boxes/big\.obj' \("):
+        catalogue.archive(catalogue["Boxes#1"]).read("boxes/big.obj")
 
 
 def test_an_unpacked_library_is_the_same(library: Path, tmp_path: Path) -> None:

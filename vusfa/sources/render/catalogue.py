@@ -14,6 +14,7 @@ from __future__ import annotations
 import os
 import re
 import zipfile
+import zlib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import cache
@@ -23,6 +24,8 @@ import numpy as np
 import yaml
 
 from vusfa.errors import SceneError
+from vusfa.limits import MAX_MODEL_BYTES
+from vusfa.reading import BoundedZip, open_regular
 
 __all__ = ["DEBIAN_FOLDER", "LICENCES", "Archive", "Catalogue", "Model", "furniture_folder"]
 
@@ -122,7 +125,7 @@ class Archive:
             }
             return
         try:
-            self._zip = zipfile.ZipFile(path)
+            self._zip = BoundedZip(path)
         except (OSError, zipfile.BadZipFile) as error:
             raise SceneError(
                 f"{path}: is no furniture library ({error}); install or copy it again"
@@ -136,8 +139,13 @@ class Archive:
         """Read a file; names are not case-sensitive, as the libraries assume."""
         try:
             found = self._names[name.lower()]
-            return (self.path / found).read_bytes() if self._zip is None else self._zip.read(found)
-        except (OSError, KeyError, zipfile.BadZipFile) as error:
+            if self._zip is None:
+                with open_regular(self.path / found, MAX_MODEL_BYTES) as file:
+                    return file.read()
+            if self._zip.getinfo(found).file_size > MAX_MODEL_BYTES:
+                raise OSError(f"it has more than {MAX_MODEL_BYTES} bytes")
+            return self._zip.read(found)
+        except (OSError, KeyError, EOFError, RuntimeError, zipfile.BadZipFile, zlib.error) as error:
             raise SceneError(f"{self.path}: cannot give {name!r} ({error}); install it again") from error
 
     def folder(self, name: str) -> list[str]:
