@@ -113,6 +113,9 @@ def test_a_checkpoint_of_version_0_1_loads():
     agent, scenes, state = load_agent(DATA / "checkpoint_0_1.pt")
     assert (scenes.names, state["frames"], state["format"]) == (("bathroom",), 48, 2)
     assert agent.config["model"] == "vusfa"
+    stood = torch.load(DATA / "checkpoint_0_1.pt", weights_only=True)["collector"]["carrier"]["step_count"]
+    assert torch.equal(state["collector"]["carrier"]["elapsed_steps"], stood)
+    assert stood.any()
     expected, found = torch.load(DATA / "expected_0_1.pt"), answers(agent)
     for name, value in found.items():
         torch.testing.assert_close(value, expected[name])

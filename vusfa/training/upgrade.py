@@ -38,6 +38,11 @@ def upgrade(state: Mapping[str, Any]) -> dict[str, Any]:
         replay["writer"] = replay.pop("cursor")
         algorithm["replay"] = replay
     new |= {"format": 2, "algorithm": algorithm, "optimizer": state.get("optimiser", {})}
+    collector = state.get("collector")
+    if isinstance(collector, Mapping) and isinstance(collector.get("carrier"), Mapping):
+        names = {"step_count": "elapsed_steps"}
+        stands = {names.get(name, name): value for name, value in collector["carrier"].items()}
+        new["collector"] = {**collector, "carrier": stands}
     new["config"] = upgrade_config(state.get("config", {}))
     new["agent"] = upgrade_agent_state(state["agent"], state["agent_config"])
     new["agent_config"] = upgrade_agent_config(state["agent_config"])
