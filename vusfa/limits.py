@@ -101,6 +101,8 @@ MAX_UNITS = 1 << 16
 MAX_CONV_SIDE = 1024
 #: Environments that step together, times the frames of their history.
 MAX_ENV_FRAMES = 1 << 26
+#: Actions of an episode whose chances a report computes, action by action.
+MAX_EPISODE_STEPS = 100_000
 #: Frames of a collector's batch, and episodes of an evaluation.
 MAX_BATCH_FRAMES, MAX_EPISODES = 1 << 28, 1 << 26
 

@@ -140,6 +140,9 @@ def read_json(path: str | os.PathLike[str], error: type[VusfaError], mend: str) 
     text = read_text(path, error, mend, limits.MAX_JSON_BYTES)
     try:
         content = json.loads(text)
+        json.dumps(
+            content, ensure_ascii=False
+        ).encode()  # half of a surrogate pair cannot be written or shown
     except _PARSING as fault:
         raise error(f"{path}: cannot be read as JSON ({fault}); {mend}") from fault
     if not isinstance(content, dict):
@@ -268,9 +271,8 @@ def read_npz(path: str | os.PathLike[str]) -> dict[str, np.ndarray]:
 
 
 def _array(file: zipfile.ZipFile, info: zipfile.ZipInfo) -> np.ndarray:
-    content = io.BytesIO(file.read(info))
     try:
-        return _read_array(content, info.file_size)
+        return _read_array(io.BytesIO(file.read(info)), info.file_size)
     except ValueError as error:
         raise ValueError(f"{info.filename}: {error}") from error
 

@@ -125,6 +125,9 @@ def test_names_that_one_command_takes_all_take(run: Run, tmp_path: Path) -> None
     assert run("check", "bathroom").stdout.endswith("bathroom.h5: sound\n")
     assert run("compact", "bathroom", tmp_path / "small.h5").exit_code == 0
     assert Scene.load(tmp_path / "small.h5").num_states == 176
+    assert run("compact", f"out={tmp_path / 'other.h5'}", tmp_path / "small.h5").exit_code == 0
+    assert Scene.load(tmp_path / "other.h5").num_states == 176
+    assert "exists" in run("compact", "bathroom", f"target={tmp_path / 'other.h5'}").stderr
     done = run("render", "plan=bathroom", "plan_only=true", f"out={tmp_path / 'plan.yaml'}")
     assert done.exit_code == 0, done.stderr
     assert "176 states" in done.stdout

@@ -12,7 +12,7 @@ from omegaconf import OmegaConf
 
 from vusfa.cli.launch import compose
 from vusfa.deploy.robustness import changed_rooms, in_changed_rooms, robustness
-from vusfa.errors import ConfigError, SceneError
+from vusfa.errors import ConfigError, ResultError, SceneError
 from vusfa.experiments.runs import read_run, read_runs
 from vusfa.report.robustness import robustness_table
 from vusfa.scenes import Scene, SceneSet
@@ -97,6 +97,13 @@ def test_names_that_a_change_cannot_have(places: Path, name: str) -> None:
     (places / "same").rename(places / name)
     with pytest.raises(ConfigError, match="cannot be called"):
         robustness(places / "checkpoint.pt", [places / name], results=places / "results")
+    assert not (places / "results").exists()
+
+
+@pytest.mark.parametrize("name", ["../elsewhere", "a/b", "x" * 300])
+def test_names_that_results_cannot_have(places: Path, name: str) -> None:
+    with pytest.raises(ResultError, match="a run cannot be called"):
+        robustness(places / "checkpoint.pt", [places / "same"], name=name, results=places / "results")
     assert not (places / "results").exists()
 
 

@@ -265,3 +265,11 @@ def test_torchrl_counts_steps_beside_it(scenes: SceneSet) -> None:
     assert data["next", "elapsed_steps"].max() == 3
     assert data["next", "truncated"].any()
     check_env_specs(TransformedEnv(TargetNavEnv(scenes, "all", [4]), StepCounter(max_steps=5)))
+
+
+@pytest.mark.parametrize("wrong", [None, 3, {"action": 1}, torch.zeros(2)])
+def test_a_step_with_something_else_than_a_tensordict(scenes: SceneSet, wrong: Any) -> None:
+    env = TargetNavEnv(scenes, goals="all", batch_size=[2])
+    env.reset()
+    with pytest.raises(ConfigError, match=r"step\(\) was given .*; give it the tensordict that reset\(\)"):
+        env.step(wrong)

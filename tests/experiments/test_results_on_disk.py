@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import dataclasses
 import json
 from pathlib import Path
 
@@ -97,3 +98,18 @@ def test_json_is_plain(tmp_path: Path, cell: Run) -> None:
     content = json.loads((write_run(tmp_path, cell) / "cell.json").read_text())
     assert content["scenes"] == ["hall", "attic"]
     assert content["max_steps"] == 700
+
+
+@pytest.mark.parametrize("limit", [0, -1, 10**12])
+def test_limits_that_no_episode_has(tmp_path: Path, cell: Run, limit: int) -> None:
+    path = write_run(tmp_path, cell) / "cell.json"
+    path.write_text(json.dumps({**json.loads(path.read_text()), "max_steps": limit}))
+    with pytest.raises(ResultError, match=f"cell.json: field 'max_steps' is {limit}"):
+        read_run(tmp_path, "table1", "vusfa-0")
+
+
+@pytest.mark.parametrize("name", ["a/b", "..", "", "../x-0", "x\0", "x" * 300])
+def test_names_that_no_folder_has(tmp_path: Path, cell: Run, name: str) -> None:
+    with pytest.raises(ResultError, match="a run cannot be called"):
+        write_run(tmp_path, dataclasses.replace(cell, name=name))
+    assert list(tmp_path.iterdir()) == []

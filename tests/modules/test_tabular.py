@@ -7,6 +7,7 @@ import torch
 from tensordict import TensorDict
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
+from vusfa.errors import SceneError
 from vusfa.modules import Agent, InferencePolicy, TabularPolicy, make_agent
 from vusfa.scenes import Scene, SceneSet
 
@@ -42,6 +43,12 @@ def test_a_state_that_is_no_goal_is_not_mistaken_for_one(rooms: SceneSet) -> Non
     _, pairs = table(rooms, torch.tensor([3]))
     with pytest.raises(IndexError):
         pairs.logits(torch.tensor([7]), torch.tensor([4]))
+
+
+@pytest.mark.parametrize("goal", [580, -1, 10**12])
+def test_a_goal_that_is_no_state(rooms: SceneSet, goal: int) -> None:
+    with pytest.raises(SceneError, match=rf"there is no state {goal}; this set has 0\.\.579"):
+        table(rooms, torch.tensor([3, goal]))
 
 
 @pytest.mark.parametrize("model", ["gvf", "vusfa"])

@@ -50,6 +50,7 @@ def run(recipe, work: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.Captu
         ("evaluation.goals=[99]", "evaluation: goal 99 is out of range"),
         ("evaluation.episodes_per_goal=0", "evaluation: episodes_per_goal is 0; it must be 1 or more"),
         ("evaluation.max_steps=0", "evaluation: max_steps is 0; it must be 1 or more"),
+        ("evaluation.max_steps=1000000000", "evaluation: max_steps is 1000000000; give at most 100,000"),
         ("evaluation.interval=0", "evaluation.interval is 0; it must be auto, a number of frames such as"),
         ("evaluation.interval=often", "evaluation.interval is 'often'; it must be auto"),
         ("evaluation.interval=0.05", "evaluation.interval is 0.05; it must be auto"),

@@ -150,6 +150,12 @@ def test_a_run_moves_with_its_scene_and_its_list_of_goals(
     again = resumed_settings(OmegaConf.to_container(settings(*small, *options)), options)
     assert Path(again["env"]["goals"]).samefile(elsewhere / "few.yaml")
     assert recipe("train").train(again).trainer.frames == 96
+    (elsewhere / "hall.h5").rename(tmp_path / "lost.h5")
+    with pytest.raises(CheckpointError, match=r"hall\.h5: there is no such file; .* give them as scenes"):
+        resumed_settings(OmegaConf.to_container(settings(*small, *options)), options)
+    options.append(f"scenes=[{tmp_path / 'lost.h5'}]")
+    again = resumed_settings(OmegaConf.to_container(settings(*small, *options)), options)
+    assert again["scenes"] == [str(tmp_path / "lost.h5")]
 
 
 def test_paths_that_version_0_1_wrote(tmp_path: Path, scene_file: Path, monkeypatch: pytest.MonkeyPatch):

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import torch
 
-from vusfa.errors import CheckpointError, ConfigError, ResultError, VusfaError
+from vusfa.errors import CheckpointError, ConfigError, ResultError, SceneError, VusfaError
 from vusfa.evaluation import Episodes
 from vusfa.experiments.runs import Run, write_run
 from vusfa.report import Options, read_run, read_source, write_report
@@ -84,6 +84,14 @@ def test_the_folder_is_sound(folder: Path) -> None:
         ("evaluation.json", b'{"rows": [{"policy": "gvf", "goals": "all", "scene": "hall", "spl": "high"}]}'),
         ("evaluation.json", b'{"settings": {"max_steps": "many"}}'),
         ("evaluation.json", b'{"settings": {"max_steps": true}}'),
+        ("evaluation.json", b'{"settings": {"max_steps": 1000000000000}}'),
+        ("evaluation.json", b'{"settings": {"max_steps": 0}}'),
+        ("evaluation.json", b'{"settings": {"max_steps": -1}}'),
+        ("config.json", rb'{"agent": {"model": "\ud800"}}'),
+        ("config.json", rb'{"agent": {"model": "gvf"}, "\uDFFF": 1}'),
+        ("metrics.csv", b"frames,success\ninf,1\n"),
+        ("metrics.csv", b"frames,success\n10,1\n1e400,1\n"),
+        ("metrics.csv", b"frames,seconds\n10,-inf\n"),
         ("evaluation_episodes.csv", b""),
         ("evaluation_episodes.csv", b"\xe9,goal\n"),
     ],
@@ -104,6 +112,15 @@ def test_episodes_of_another_scene(folder: Path, old: str, new: str) -> None:
     table.write_text(table.read_text().replace(old, new, 1))
     with pytest.raises(ConfigError, match=r"run: its episodes in '(attic|hall)' are of another scene"):
         gather([read_run(folder)])
+
+
+def test_scenes_that_have_moved_and_pairs_of_surrogates(folder: Path, tmp_path: Path) -> None:
+    (tmp_path / "hall.h5").rename(tmp_path / "away.h5")
+    with pytest.raises(SceneError, match=r"hall\.h5: there is no such file; .*/run have moved, put them"):
+        gather([read_run(folder)])
+    settings = {**SETTINGS, "scenes": [str(tmp_path / "away.h5")], "name": "\U0001f600"}
+    (folder / "config.json").write_text(json.dumps(settings))  # written as a pair, which is a character
+    assert read_run(folder).settings["name"] == "\U0001f600"
 
 
 @pytest.mark.parametrize("wrong", [float("nan"), float("inf")])

@@ -92,6 +92,15 @@ def test_distance_takes_numbers_and_broadcasts(rooms: SceneSet) -> None:
     ]
 
 
+@pytest.mark.parametrize(("ids", "wrong"), [([0, -1], -1), (10**6, 10**6), ([[3], [10**12]], 10**12)])
+def test_ids_that_are_no_states(rooms: SceneSet, ids: Any, wrong: int) -> None:
+    calls = [lambda: rooms.distance(ids, 0), lambda: rooms.distance(0, ids)]
+    calls += [lambda: rooms.local_id(ids), lambda: rooms.pictures(ids)]
+    for call in calls:
+        with pytest.raises(SceneError, match=f"there is no state {wrong}; this set has 0"):
+            call()
+
+
 def test_opens_names_and_files_alike(make_file: Callable[..., Path], tmp_path: Path) -> None:
     bathroom = Scene.bundled("bathroom")
     copied = tmp_path / "copy.h5"

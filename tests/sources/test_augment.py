@@ -109,6 +109,10 @@ def test_sources_that_do_not_fit(make_scene: Callable[..., Scene], network: Back
         augment_scene([one, wide], tmp_path / "more.h5", network)
     with pytest.raises(ConfigError, match="pictures is 0"):
         augment_scene([one], tmp_path / "more.h5", network, pictures=0)
+    with pytest.raises(ConfigError, match=r"pictures is 1000000000; give 1 to 1,000"):
+        augment_scene([one], tmp_path / "more.h5", network, pictures=10**9)
+    with pytest.raises(ConfigError, match="seed is -1; give 0 or more"):
+        augment_scene([one], tmp_path / "more.h5", network, seed=-1)
     assert not (tmp_path / "more.h5").exists()
 
 
@@ -152,5 +156,8 @@ def test_blur_is_a_mean_of_neighbours() -> None:
 def test_values_out_of_range() -> None:
     with pytest.raises(ConfigError, match="jpeg is 0; give a number between 1 and 95"):
         Augmentation(jpeg=0)
-    with pytest.raises(ConfigError, match=r"zoom is 1\.2"):
+    with pytest.raises(ConfigError, match=r"strength is 10, too much: zoom is 1\.2"):
         Augmentation().scaled(10)
+    for strength in (float("nan"), float("inf"), -1.0):
+        with pytest.raises(ConfigError, match=f"strength is {strength}; give a number of 0 or more"):
+            Augmentation().scaled(strength)

@@ -71,6 +71,19 @@ def test_a_process_alone_is_alone(environ: dict[str, str]):
         assert ranks.is_first
 
 
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [("RANK", "one"), ("WORLD_SIZE", "2.0"), ("MASTER_PORT", "http"), ("LOCAL_RANK", "-1"), ("RANK", "2")],
+)
+def test_variables_that_are_no_numbers_of_ranks(name: str, text: str):
+    environ = {"RANK": "0", "WORLD_SIZE": "2", "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": "1", name: text}
+    with (
+        pytest.raises(ConfigError, match=f"the environment's {name} is '?{text}"),
+        joined(settings(), environ),
+    ):
+        pass
+
+
 def part(first: int, episodes: float) -> dict[str, Any]:
     carrier = {"goal_id": torch.arange(first, first + 2), "next": {"x": torch.full((2, 1), first)}}
     collector = {"env": {"_": first}, "generator": first, "batch_size": [2], "carrier": carrier}

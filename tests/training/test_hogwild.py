@@ -10,7 +10,7 @@ import pytest
 import torch
 from omegaconf import OmegaConf
 
-from vusfa.errors import ConfigError
+from vusfa.errors import ConfigError, WorkerError
 from vusfa.experiments.training import compose_settings, train
 from vusfa.training import EpisodeMeter, HogwildTrainer, load_checkpoint, make_trainer
 from vusfa.training.hogwild import _make_single
@@ -100,3 +100,15 @@ def test_meters_add_up(rooms: Any) -> None:
     first.add(second.state_dict())
     first.add(second.state_dict())
     assert (first.flush()["episodes"], second.flush()["collisions"]) == (2.0, 0.5)
+
+
+def test_workers_that_the_system_refuses(monkeypatch: pytest.MonkeyPatch) -> None:
+    trainer = make_trainer(made("collector=hogwild"))
+
+    def refuse(process: Any) -> None:
+        raise OSError(24, "Too many open files", "popen_spawn_posix.py")
+
+    monkeypatch.setattr(multiprocessing.process.BaseProcess, "start", refuse)
+    words = r"the collector's workers cannot start: .*Too many open files.*; give fewer collector.num_workers"
+    with pytest.raises(WorkerError, match=words), trainer.collecting():
+        pass

@@ -33,7 +33,10 @@ class Command(TyperCommand):
         options = {
             name: param for param in self.params if isinstance(param, TyperOption) for name in param.opts
         }
+        # the file to write is an argument of some commands, an option of others: out=FILE is right for all
+        positional = "--out" not in options and any(param.name == "target" for param in self.params)
         words: list[str] = []
+        targets: list[str] = []
         taking: TyperOption | None = None  # the preceding option, if it takes values
         for place, word in enumerate(args):
             name, equals, value = word.partition("=")
@@ -48,12 +51,14 @@ class Command(TyperCommand):
                 words += [] if taking is not None and taking.multiple else [word]
             elif taking is not None and not taking.multiple:
                 words, taking = [*words, word], None
+            elif positional and equals and name in ("out", "target"):
+                taking, targets = None, [*targets, value]
             elif setting is not None:
                 taking = None
                 words += _spelled(setting, value)
             else:
                 words += [word] if taking is None else [taking.opts[0], word]
-        return super().parse_args(ctx, words)
+        return super().parse_args(ctx, [*words, *targets])
 
 
 def _spelled(option: TyperOption, value: str) -> list[str]:

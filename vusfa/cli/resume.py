@@ -7,6 +7,7 @@ recorded command line is never run.
 from __future__ import annotations
 
 import copy
+import os
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -52,6 +53,12 @@ def resumed_settings(given: Mapping[str, Any], overrides: Sequence[str]) -> dict
         if name.startswith("~") or name.lstrip("+") == "preset":
             raise ConfigError(f"{name} cannot be given beside resume; give the settings themselves")
         _copy(given, settings, name.lstrip("+").split("."))
+    lost = next((place for place in sources or () if "/" in place and not os.path.exists(place)), None)
+    if lost and "scenes" not in names:
+        raise CheckpointError(
+            f"{lost}: there is no such file; if the scenes of {path} have moved, put them beside it or give"
+            " them as scenes"
+        )
     settings["resume"] = str(path)
     for group in ("optim", "entropy"):
         origin = given if group in names else stored

@@ -62,9 +62,10 @@ def _launch_by_hydra(plugin: str, jobs: Sequence[Job], options: Mapping[str, str
     except ModuleNotFoundError as error:
         raise ConfigError(f"the launcher needs {error.name}: pip install 'vusfa[cluster]'") from error
 
+    quoted = str(folder).replace("\\", "\\\\").replace("'", "\\'")
     settings = [
         f"hydra/launcher={plugin}",
-        f"hydra.sweep.dir='{folder}'",
+        f"hydra.sweep.dir='{quoted}'",
         "hydra.sweep.subdir=.",
         "hydra.output_subdir=null",
         "hydra/job_logging=none",

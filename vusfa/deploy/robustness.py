@@ -14,7 +14,7 @@ from vusfa.evaluation.baselines import SHORTEST_PATH
 from vusfa.evaluation.exact import exact_goals, uniform_probabilities
 from vusfa.evaluation.long_table import MEAN_OF_STATES
 from vusfa.experiments.measure import evaluation_policy, evaluation_precision
-from vusfa.experiments.runs import Run, write_run
+from vusfa.experiments.runs import Run, check_run_name, write_run
 from vusfa.limits import brief
 from vusfa.modules import Agent
 from vusfa.scenes import SceneSet
@@ -103,8 +103,9 @@ def robustness(
     set_threads(threads)
     if episodes < 1:
         raise ConfigError(f"episodes is {episodes}; give 1 or more")
-    agent, own, state = load_agent(checkpoint_file(checkpoint))
     names = _change_names(changes)
+    agent, own, state = load_agent(checkpoint_file(checkpoint))
+    check_run_name(f"{name}-{state['config']['seed']}")  # before the work
     worlds = {UNCHANGED: own, **{n: changed_rooms(own, path) for n, path in zip(names, changes, strict=True)}}
     tables: dict[str, Episodes] = {}
     with EvaluationProgress() as progress, evaluation_precision(agent, state["config"]):

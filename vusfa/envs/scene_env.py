@@ -10,7 +10,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 import torch
-from tensordict import TensorDictBase
+from tensordict import TensorDictBase, is_tensor_collection
 from torch import Tensor
 
 from vusfa.envs.rendering import draw_panels
@@ -122,6 +122,15 @@ class SceneEnv(StatelessEnv):
         check_counts(max_steps=(max_steps, 1))
         check_home(policy, self.scenes)
         return super().rollout(max_steps, policy, *args, **options)
+
+    def step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """As :meth:`EnvBase.step`; anything but a tensordict is a ``ConfigError``."""
+        if not is_tensor_collection(tensordict):
+            raise ConfigError(
+                f"step() was given {brief(tensordict)}; give it the tensordict that reset() returned, with an"
+                " action in it"
+            )
+        return super().step(tensordict)
 
     def _make_specs(self, shortest_path: bool) -> None:
         specs = env_specs(self.scenes, self.batch_size, self.history, shortest_path)

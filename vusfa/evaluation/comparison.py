@@ -20,6 +20,7 @@ from vusfa.evaluation.navigation import evaluate
 from vusfa.evaluation.starts import Unreachable, episode_starts
 from vusfa.evaluation.summary import count_pairs, random_walk_summary, summary
 from vusfa.files import write_csv, write_json
+from vusfa.limits import MAX_EPISODE_STEPS
 from vusfa.scenes import SceneSet
 
 __all__ = ["Comparison", "check_comparison", "compare"]
@@ -86,6 +87,8 @@ def check_comparison(
     for name, value in (("episodes_per_goal", episodes_per_goal), ("max_steps", max_steps)):
         if value < 1:
             raise ConfigError(f"evaluation: {name} is {value}; it must be 1 or more")
+    if max_steps > MAX_EPISODE_STEPS:
+        raise ConfigError(f"evaluation: max_steps is {max_steps}; give at most {MAX_EPISODE_STEPS:,}")
     try:
         ids = resolve_goals(scenes, goals)
         episode_starts(scenes, ids, 1, unreachable=unreachable, generator=torch.Generator())

@@ -29,10 +29,10 @@ from vusfa.evaluation.episodes import Episodes
 from vusfa.evaluation.exact import ExactGoals
 from vusfa.evaluation.long_table import episode_rows, exact_rows, join_tables, row_label
 from vusfa.files import write_json
-from vusfa.limits import brief
+from vusfa.limits import MAX_EPISODE_STEPS, brief
 from vusfa.reading import check_fields, read_json, read_npz
 
-__all__ = ["Run", "read_run", "read_runs", "write_run"]
+__all__ = ["Run", "check_run_name", "read_run", "read_runs", "write_run"]
 
 _EXACT = "exact"
 _AGAIN = "delete the folder and run it again"
@@ -100,7 +100,7 @@ def write_run(root: str | Path, run: Run) -> Path:
     """Write a run's folder, replacing one of the same name.
 
     Raises:
-        ResultError: a mode of evaluation is called ``exact``, or cannot be the name of a file.
+        ResultError: a mode of evaluation is called ``exact``, or it or the run cannot be the name of a file.
 
     >>> import tempfile
     >>> with tempfile.TemporaryDirectory() as root:
@@ -110,6 +110,7 @@ def write_run(root: str | Path, run: Run) -> Path:
     """
     for name in run.episodes:
         _check_mode(name, root)
+    check_run_name(run.name)
     folder = Path(root) / run.experiment / run.name
     folder.parent.mkdir(parents=True, exist_ok=True)
     unfinished = Path(tempfile.mkdtemp(prefix=f".{run.name}.", dir=folder.parent))
@@ -135,6 +136,18 @@ def write_run(root: str | Path, run: Run) -> Path:
     return folder
 
 
+def check_run_name(name: str) -> None:
+    """Refuse with a ResultError what cannot be the name of a run's folder.
+
+    >>> check_run_name("../elsewhere-0")
+    Traceback (most recent call last):
+    ...
+    vusfa.errors.ResultError: a run cannot be called '../elsewhere-0'; give the name of a folder, without /
+    """
+    if "/" in name or "\0" in name or name.strip(".") == "" or len(name.encode("utf-8", "replace")) > 200:
+        raise ResultError(f"a run cannot be called {brief(name)}; give the name of a folder, without /")
+
+
 def _check_mode(name: Any, path: str | Path) -> None:
     if not isinstance(name, str) or name == _EXACT or not name.replace("-", "_").isidentifier():
         raise ResultError(f"{path}: episodes are called {brief(name)}; give a name of letters, digits and -")
@@ -154,6 +167,8 @@ def read_run(root: str | Path, experiment: str, name: str) -> Run:
     check_fields(content.get("info", {}), _FACTS, path, ResultError, _AGAIN)
     if "info" not in content:
         raise ResultError(f"{path}: field 'info' is missing; {_AGAIN}")
+    if not bool(content["episodes"]) <= content["max_steps"] <= MAX_EPISODE_STEPS:
+        raise ResultError(f"{path}: field 'max_steps' is {brief(content['max_steps'])}; {_AGAIN}")
     episodes = {}
     for mode in content["episodes"]:
         _check_mode(mode, path)

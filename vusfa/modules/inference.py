@@ -216,7 +216,7 @@ class TabularPolicy(AtHome, TensorDictModuleBase):
         state, goal, scene: (P,) int64, of each pair: global ids, and the scene's index.
 
     Raises:
-        ValueError: for an agent of more than one frame, or of observations, or made for other scenes.
+        ValueError: an agent of more than one frame, of observations, or of other scenes; no such goal.
 
     >>> from tensordict import TensorDict
     >>> from vusfa.modules import make_agent
@@ -242,7 +242,7 @@ class TabularPolicy(AtHome, TensorDictModuleBase):
         self.home = agent.home
         self.in_keys, self.out_keys = ["state_id", "goal_id"], ["action"]
         every = torch.arange(scenes.num_states, device=scenes.device)
-        goals = every if goals is None else goals.to(scenes.device).unique()  # sorted, hence scene by scene
+        goals = every if goals is None else scenes.known(goals).unique()  # sorted, hence scene by scene
         scene = scenes.scene_id[goals]
         size, offset = scenes.offsets.diff()[scene], scenes.offsets[scene]
         first = size.cumsum(0) - size

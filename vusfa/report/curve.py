@@ -17,9 +17,13 @@ def read_metrics(path: str | Path) -> dict[str, np.ndarray]:
     """The columns of a run's ``metrics.csv``, each (n,) float64; an empty field is NaN.
 
     Raises:
-        ConfigError: the file is missing, or a field is not a number.
+        ConfigError: the file is missing, or a field is not a number; frames or seconds are infinite.
     """
-    columns = read_csv(path, ConfigError, "a run writes metrics.csv in its folder, see docs/training.md")
+    mend = "a run writes metrics.csv in its folder, see docs/training.md"
+    columns = read_csv(path, ConfigError, mend)
+    for name in ("frames", "seconds"):
+        if np.isinf(columns.get(name, 0.0)).any():
+            raise ConfigError(f"{path}: column {name!r} holds an infinite number; {mend}")
     return {name: column for name, column in columns.items() if len(column)}
 
 

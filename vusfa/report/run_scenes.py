@@ -8,7 +8,7 @@ from typing import Any
 
 import torch
 
-from vusfa.errors import ConfigError
+from vusfa.errors import ConfigError, SceneError
 from vusfa.evaluation import Episodes
 from vusfa.limits import listing
 from vusfa.report.runs import LoggedRun
@@ -59,7 +59,11 @@ def _world(
             raise ConfigError(f"scenes: {run.folder} is of {missing[0]!r}, which is not among them; add it")
         world = SceneSet([given.scenes[given.scene_index(name)] for name in names])
     elif saved["sources"]:
-        world = opened(tuple(saved["sources"]))
+        try:
+            world = opened(tuple(saved["sources"]))
+        except SceneError as error:
+            mend = f"if the scenes of {run.folder} have moved, put them beside it or give them as scenes"
+            raise SceneError(f"{error}; {mend}") from error
     else:
         return None
     if saved["fingerprint"]:

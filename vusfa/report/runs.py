@@ -18,7 +18,7 @@ from vusfa.evaluation import Episodes
 from vusfa.evaluation.exact import ExactGoals
 from vusfa.evaluation.long_table import WITHIN, episode_rows, exact_rows, join_tables, row_label
 from vusfa.files import plain_cell
-from vusfa.limits import brief
+from vusfa.limits import MAX_EPISODE_STEPS, brief
 from vusfa.reading import check_fields, read_csv, read_json
 from vusfa.report.curve import read_metrics
 from vusfa.training import row_name
@@ -238,6 +238,11 @@ def _evaluation(folder: Path) -> tuple[Episodes | None, list[dict[str, Any]], st
         check_fields(content, {"settings": dict, "rows": list}, summary, ConfigError, _AGAIN)
         settings, rows = content.get("settings", {}), content.get("rows", [])
         check_fields(settings, {"max_steps": int, "sample": bool}, summary, ConfigError, _AGAIN)
+        if not 1 <= settings.get("max_steps", MAX_STEPS) <= MAX_EPISODE_STEPS:
+            raise ConfigError(
+                f"{summary}: field 'max_steps' is {brief(settings['max_steps'])}; it is from 1 to"
+                f" {MAX_EPISODE_STEPS:,}; {_AGAIN}"
+            )
         if not all(_is_summary(row) for row in rows):
             raise ConfigError(f"{summary}: a row of 'rows' is no row of a summary; {_AGAIN}")
         episodes = read_episodes(table, settings.get("max_steps", MAX_STEPS))

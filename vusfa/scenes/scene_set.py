@@ -176,9 +176,7 @@ class SceneSet:
         Returns:
             int64 of the broadcast shape, in actions; -1 where the goal is unreachable or in another scene.
         """
-        state, goal = torch.broadcast_tensors(
-            *(torch.as_tensor(ids, dtype=torch.int64, device=self.device) for ids in (state, goal))
-        )
+        state, goal = torch.broadcast_tensors(self.known(state), self.known(goal))
         scene = torch.where(self.scene_id[state] == self.scene_id[goal], self.scene_id[state], -1).cpu()
         found = torch.full_like(scene, -1)
         for index in scene.unique().tolist():
@@ -213,13 +211,10 @@ class SceneSet:
         """
         index = self.scene_index(scene)
         ids = torch.as_tensor(local, dtype=torch.int64, device=self.device)
-        num_states = self.scenes[index].num_states
-        wrong = ids[(ids < 0) | (ids >= num_states)]
+        name, last = self.names[index], self.scenes[index].num_states - 1
+        wrong = ids[(ids < 0) | (ids > last)]
         if wrong.numel():
-            name = self.names[index]
-            raise SceneError(
-                f"scene {name!r} has no state {int(wrong[0])}; its states are 0..{num_states - 1}"
-            )
+            raise SceneError(f"scene {name!r} has no state {int(wrong[0])}; its states are 0..{last}")
         return ids + self.offsets[index]
 
     def local_id(self, ids: Any) -> Tensor:
@@ -228,8 +223,16 @@ class SceneSet:
         >>> SceneSet.bundled().local_id([0, 176, 179]).tolist()
         [0, 0, 3]
         """
-        ids = torch.as_tensor(ids, dtype=torch.int64, device=self.device)
+        ids = self.known(ids)
         return ids - self.offsets[self.scene_id[ids]]
+
+    def known(self, ids: Any) -> Tensor:
+        """Global ids of any shape as int64 on the set's device; one that is no state is a SceneError."""
+        ids = torch.as_tensor(ids, dtype=torch.int64, device=self.device)
+        wrong = ids[(ids < 0) | (ids >= self.num_states)]
+        if wrong.numel():
+            raise SceneError(f"there is no state {int(wrong[0])}; this set has 0..{self.num_states - 1}")
+        return ids
 
     def pictures(self, ids: Any) -> Tensor:
         """Read the pictures of states from the scenes' files.
@@ -243,11 +246,8 @@ class SceneSet:
         Raises:
             SceneError: a state does not exist, a scene has no pictures, or their sizes differ.
         """
-        ids = torch.as_tensor(ids, dtype=torch.int64).cpu()
+        ids = self.known(ids).cpu()
         flat = ids.reshape(-1).numpy()
-        wrong = flat[(flat < 0) | (flat >= self.num_states)]
-        if wrong.size:
-            raise SceneError(f"there is no state {wrong[0]}; this set has 0..{self.num_states - 1}")
         offsets = self.offsets.cpu().numpy()
         scene_id = np.searchsorted(offsets, flat, side="right") - 1
         indices = np.unique(scene_id).tolist() or [0]

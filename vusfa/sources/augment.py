@@ -7,6 +7,7 @@ scene, training draws one at each step (``env.crop=random``).
 from __future__ import annotations
 
 import io
+import math
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
@@ -26,6 +27,8 @@ from vusfa.sources.row_log import file_sha256
 
 __all__ = ["Augmentation", "augment_picture", "augment_scene"]
 
+#: Changed pictures per state: as many crops more are in the file, and in memory.
+MAX_PICTURES = 1000
 #: JPEG files have qualities of 1 to 95.
 _BEST_QUALITY = 95
 _RANGES = {"jpeg": (1, _BEST_QUALITY), "turn": (0, 180), "noise": (0, 255)}
@@ -75,10 +78,14 @@ class Augmentation:
         >>> half.zoom, half.jpeg
         (0.06, 68)
         """
+        if not 0 <= strength < math.inf:
+            raise ConfigError(f"strength is {strength}; give a number of 0 or more")
         values = {field.name: strength * getattr(self, field.name) for field in fields(self)}
-        return Augmentation(
-            **{**values, "jpeg": round(_BEST_QUALITY - strength * (_BEST_QUALITY - self.jpeg))}
-        )
+        values["jpeg"] = round(_BEST_QUALITY - strength * (_BEST_QUALITY - self.jpeg))
+        try:
+            return Augmentation(**values)  # type: ignore[arg-type]
+        except ConfigError as error:
+            raise ConfigError(f"strength is {strength}, too much: {error}") from error
 
 
 def augment_picture(
@@ -173,10 +180,13 @@ def augment_scene(
     Raises:
         SceneError: a source has faults, no pictures, several crops, other features, or another graph; the
             target cannot be written.
-        ConfigError: there is no such network, it makes several crops, or ``pictures`` is not positive.
+        ConfigError: there is no such network, it makes several crops, or ``pictures`` or ``seed`` is out of
+            range.
     """
-    if pictures < 1:
-        raise ConfigError(f"pictures is {pictures}; give 1 or more")
+    if not 1 <= pictures <= MAX_PICTURES:
+        raise ConfigError(f"pictures is {pictures}; give 1 to {MAX_PICTURES:,}")
+    if seed < 0:
+        raise ConfigError(f"seed is {seed}; give 0 or more")
     augmentation = augmentation or Augmentation()
     network = load_backbone(backbone) if isinstance(backbone, str) else backbone
     if network.preprocessing.num_crops != 1:

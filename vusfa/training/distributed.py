@@ -34,7 +34,8 @@ import torch
 from torch import Tensor, distributed, nn
 from torchrl.collectors import BaseCollector
 
-from vusfa.errors import RankError, VusfaError
+from vusfa.errors import ConfigError, RankError, VusfaError
+from vusfa.limits import brief
 from vusfa.training.content import restore
 from vusfa.training.ranks import Ranks, check_ranks, merged, share
 
@@ -60,13 +61,23 @@ def joined(settings: Mapping[str, Any], environ: Mapping[str, str] = os.environ)
             they are missing, this process is alone.
 
     Raises:
-        ConfigError: settings that ranks cannot share (on rank 0; a RankError on the others).
+        ConfigError: settings that ranks cannot share (on rank 0; a RankError on the others), or variables
+            that are no numbers.
         RankError: the ranks do not find each other.
     """
-    if any(not environ.get(name) for name in VARIABLES) or int(environ["WORLD_SIZE"]) < 2:
+    if any(not environ.get(name) for name in VARIABLES):
         yield Ranks()
         return
-    rank, size = int(environ["RANK"]), int(environ["WORLD_SIZE"])
+    numbers = {name: environ.get(name, "0") for name in (*VARIABLES, "LOCAL_RANK") if name != "MASTER_ADDR"}
+    for name, text in numbers.items():
+        if not (text.isascii() and text.isdecimal() and len(text) < 10):
+            raise ConfigError(f"the environment's {name} is {brief(text)}; torchrun sets it to a number")
+    rank, size = int(numbers["RANK"]), int(numbers["WORLD_SIZE"])
+    if rank >= max(size, 1):
+        raise ConfigError(f"the environment's RANK is {rank}; of {size} ranks the last is {size - 1}")
+    if size < 2:
+        yield Ranks()
+        return
     try:
         check_ranks(settings, size)
     except VusfaError as error:  # all ranks find the same

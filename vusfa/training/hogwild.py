@@ -30,7 +30,7 @@ from vusfa.errors import ConfigError, WorkerError
 from vusfa.objectives import TFRMSprop
 from vusfa.training.collectors import MakeEnv, make_collector, rows_per_worker
 from vusfa.training.trainer import Trainer
-from vusfa.training.workers import Silence, begin_worker, end_of
+from vusfa.training.workers import Silence, begin_worker, cannot_start, end_of
 
 __all__ = ["HogwildTrainer"]
 
@@ -136,6 +136,10 @@ class _Workers:
                 sender.close()  # the worker's alone: its end is then the end of its reports
                 self.procs.append(process)
                 self.reports.append(receiver)
+        except OSError as error:
+            self.patience = 0.0
+            self.close()
+            raise cannot_start(error) from error
         except BaseException:
             self.close()
             raise

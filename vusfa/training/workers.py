@@ -23,7 +23,7 @@ from torchrl.collectors import BaseCollector
 
 from vusfa.errors import VusfaError, WorkerError
 
-__all__ = ["Silence", "begin_worker", "end_of", "started", "supervised", "watch"]
+__all__ = ["Silence", "begin_worker", "cannot_start", "end_of", "started", "supervised", "watch"]
 
 #: What one wait, or one update between two waits, counts at most towards a time limit, in seconds: a
 #: training that was suspended (Ctrl-Z, a laptop's lid) does not hold that against its workers.
@@ -84,11 +84,16 @@ def started(limit: float | None) -> Iterator[None]:
             child.join()
         if isinstance(error, VusfaError) and not isinstance(error, WorkerError):
             raise
-        reason = " ".join(str(error).split("\n")[0].split()) or type(error).__name__
-        raise WorkerError(
-            f"the collector's workers cannot start: {reason}; give fewer collector.num_workers, or allow more"
-            " memory, processes and open files (ulimit)"
-        ) from error
+        raise cannot_start(error) from error
+
+
+def cannot_start(error: Exception) -> WorkerError:
+    """The error of workers that the system refuses to start, or that die at it."""
+    reason = " ".join(str(error).split("\n")[0].split()) or type(error).__name__
+    return WorkerError(
+        f"the collector's workers cannot start: {reason}; give fewer collector.num_workers, or allow more"
+        " memory, processes and open files (ulimit)"
+    )
 
 
 @contextmanager
