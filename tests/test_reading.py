@@ -181,3 +181,19 @@ def test_only_regular_files_of_bounded_size(tmp_path: Path) -> None:
         file.truncate(1 << 40)
     with pytest.raises(ConfigError, match="more than 1048576 bytes"):
         read_text(tmp_path / "sparse", ConfigError, MEND)
+
+
+def test_what_a_parser_says_is_one_bounded_line(tmp_path: Path) -> None:
+    (tmp_path / "a.csv").write_text("frames\n" + "x" * 100_000 + "\n")
+    with pytest.raises(ConfigError, match=r"a\.csv: cannot be read as CSV, row 2 \(could not") as caught:
+        read_csv(tmp_path / "a.csv", ConfigError, MEND)
+    assert len(str(caught.value)) < 1000
+    for text in ("hall: [3, {", "hall: 'x", "- a\n b: [", "? " + "x" * 5000 + "\n: ]"):
+        with pytest.raises(ConfigError, match=r"goals\.yaml: cannot be read as YAML") as caught:
+            parse_yaml(text, "goals.yaml", ConfigError, MEND)
+        assert "\n" not in str(caught.value)
+        assert len(str(caught.value)) < 1000
+    for text in (rb'{"a": "\ud800"}', rb'{"\uDFFFx": 1}', rb'{"a": ["\udc00\ud800"]}'):
+        (tmp_path / "a.json").write_bytes(text)
+        with pytest.raises(ConfigError, match=r"a\.json: cannot be read as JSON \(.*surrogates"):
+            read_json(tmp_path / "a.json", ConfigError, MEND)

@@ -11,7 +11,7 @@ from collections.abc import Iterable
 from itertools import islice
 from typing import Any
 
-__all__ = ["brief", "listing"]
+__all__ = ["brief", "listing", "one_line"]
 
 # ---- scenes (HDF5)
 
@@ -137,3 +137,13 @@ def listing(names: Iterable[str], most: int = 20) -> str:
     """
     first = list(islice(names, most + 1))
     return ", ".join([*first[:most], *(["..."] if len(first) > most else [])])
+
+
+def one_line(fault: object) -> str:
+    """What another library says of a fault, as messages quote it: on one line, and bounded.
+
+    >>> one_line("while parsing a list\\n  in line 3"), len(one_line("x" * 10_000))
+    ('while parsing a list in line 3', 300)
+    """
+    text = " ".join(str(fault).split())
+    return text if len(text) <= 300 else f"{text[:297]}..."

@@ -19,7 +19,7 @@ import yaml
 
 from vusfa import limits
 from vusfa.errors import ResultError, VusfaError
-from vusfa.limits import brief
+from vusfa.limits import brief, one_line
 
 __all__ = [
     "BoundedZip",
@@ -97,7 +97,7 @@ def parse_yaml(text: str, source: str, error: type[VusfaError], mend: str) -> An
         _check_yaml(yaml.parse(text, Loader=_Loader))
         return yaml.load(text, _Loader)
     except (yaml.YAMLError, *_PARSING) as fault:
-        raise error(f"{source}: cannot be read as YAML ({' '.join(str(fault).split())}); {mend}") from fault
+        raise error(f"{source}: cannot be read as YAML ({one_line(fault)}); {mend}") from fault
 
 
 class _Loader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # type: ignore[misc]
@@ -140,11 +140,9 @@ def read_json(path: str | os.PathLike[str], error: type[VusfaError], mend: str) 
     text = read_text(path, error, mend, limits.MAX_JSON_BYTES)
     try:
         content = json.loads(text)
-        json.dumps(
-            content, ensure_ascii=False
-        ).encode()  # half of a surrogate pair cannot be written or shown
+        json.dumps(content, ensure_ascii=False).encode()  # fails for half of a surrogate pair
     except _PARSING as fault:
-        raise error(f"{path}: cannot be read as JSON ({fault}); {mend}") from fault
+        raise error(f"{path}: cannot be read as JSON ({one_line(fault)}); {mend}") from fault
     if not isinstance(content, dict):
         raise error(f"{path}: holds {brief(content)} in place of an object; {mend}")
     return content
@@ -204,7 +202,7 @@ def read_csv(
     except OSError as fault:
         raise error(f"{path}: cannot be read ({fault}); {mend}") from fault
     except (csv.Error, ValueError) as fault:
-        raise error(f"{path}: cannot be read as CSV, row {row} ({fault}); {mend}") from fault
+        raise error(f"{path}: cannot be read as CSV, row {row} ({one_line(fault)}); {mend}") from fault
     table = iter(np.array(numbers).reshape(-1, max(1, len(names) - len(texts))).T)
     return {name: texts[place] if place in texts else next(table) for place, name in enumerate(names)}
 
@@ -267,7 +265,7 @@ def read_npz(path: str | os.PathLike[str]) -> dict[str, np.ndarray]:
             raise ValueError(f"its arrays have more than {limits.MAX_NPZ_ELEMENTS} elements")
         return arrays
     except (OSError, EOFError, zipfile.BadZipFile, zlib.error, RuntimeError, *_PARSING) as error:
-        raise ResultError(f"{path}: cannot be read ({error}); make it again") from error
+        raise ResultError(f"{path}: cannot be read ({one_line(error)}); make it again") from error
 
 
 def _array(file: zipfile.ZipFile, info: zipfile.ZipInfo) -> np.ndarray:

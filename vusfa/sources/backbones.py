@@ -32,7 +32,7 @@ import torch
 from torch import Tensor, nn
 
 from vusfa.errors import ConfigError
-from vusfa.limits import brief
+from vusfa.limits import one_line
 from vusfa.reading import BoundedZip
 from vusfa.sources.crops import Preprocessing
 from vusfa.sources.layers import Features, Patches, UpTo
@@ -204,8 +204,9 @@ def _load_weights(network: nn.Module, path: Path, wanted_by: str) -> None:
     except ConfigError:
         raise
     except Exception as error:  # a damaged file may raise anything
-        reason = brief(" ".join(str(error).split()))
-        raise ConfigError(f"{path}: are no weights of {wanted_by} ({reason}); give its state dict") from error
+        raise ConfigError(
+            f"{path}: are no weights of {wanted_by} ({one_line(error)}); give its state dict"
+        ) from error
 
 
 def _check_records(path: Path) -> None:
@@ -235,7 +236,7 @@ def _torchvision(model: str, weights: Path, layer: str | None) -> Backbone:
     try:
         network = models.get_model(model, weights=None)
     except (ValueError, KeyError) as error:
-        raise ConfigError(f"torchvision has no model {model!r} ({error})") from error
+        raise ConfigError(f"torchvision has no model {model!r} ({one_line(error)})") from error
     _load_weights(network, weights, name)
     if layer is None and not hasattr(network, "avgpool"):
         children = ", ".join(child for child, _ in network.named_children())
@@ -250,7 +251,7 @@ def _timm(model: str, weights: Path, layer: str | None) -> Backbone:
     try:
         network = timm.create_model(model, pretrained=False)
     except (RuntimeError, ValueError) as error:
-        raise ConfigError(f"timm has no model {model!r} ({error})") from error
+        raise ConfigError(f"timm has no model {model!r} ({one_line(error)})") from error
     _load_weights(network, weights, name)
     config = timm.data.resolve_model_data_config(network)
     size = int(config["input_size"][-1])
@@ -276,7 +277,9 @@ def _torchscript(path: Path) -> Backbone:
     try:
         network = torch.jit.load(path, map_location="cpu")
     except (RuntimeError, ValueError) as error:
-        raise ConfigError(f"{path}: is no TorchScript file ({error}); torch.jit.save makes one") from error
+        raise ConfigError(
+            f"{path}: is no TorchScript file ({one_line(error)}); torch.jit.save makes one"
+        ) from error
     return Backbone(path.name, "output", file_sha256(path), Preprocessing(crops="centre"), network)
 
 
@@ -285,7 +288,7 @@ def _onnx(path: Path, layer: str | None) -> Backbone:
     try:
         session = runtime.InferenceSession(str(path), providers=["CPUExecutionProvider"])
     except Exception as error:  # onnxruntime has an exception class for each status
-        raise ConfigError(f"{path}: is no ONNX file that can be run ({error})") from error
+        raise ConfigError(f"{path}: is no ONNX file that can be run ({one_line(error)})") from error
     outputs = [output.name for output in session.get_outputs()]
     output = layer or outputs[0]
     if output not in outputs:

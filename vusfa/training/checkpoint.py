@@ -40,7 +40,7 @@ from torch import Tensor
 from vusfa.conf.settings import flat
 from vusfa.errors import CheckpointError, SceneError, VusfaError
 from vusfa.files import replacing
-from vusfa.limits import brief, listing
+from vusfa.limits import brief, listing, one_line
 from vusfa.modules import Agent, make_agent
 from vusfa.scenes import SceneSet
 from vusfa.training.content import NO_VALIDATION, check_entries, check_like, mended, read_content
@@ -246,7 +246,7 @@ def saved_agent(path: str | Path, state: Mapping[str, Any], scenes: SceneSet) ->
     except VusfaError as error:
         raise CheckpointError(f"{path}: {error}") from error
     except (TypeError, ValueError, KeyError, AttributeError, IndexError, RuntimeError) as error:
-        raise mended(path, f"no agent can be made of its entry 'agent_config' ({error})") from error
+        raise mended(path, f"no agent can be made of its entry 'agent_config' ({one_line(error)})") from error
     load_weights(agent, state, path)
     return agent.eval()
 
