@@ -83,7 +83,7 @@ class Augmentation:
         values = {field.name: strength * getattr(self, field.name) for field in fields(self)}
         values["jpeg"] = round(_BEST_QUALITY - strength * (_BEST_QUALITY - self.jpeg))
         try:
-            return Augmentation(**values)  # type: ignore[arg-type]
+            return Augmentation(**values)
         except ConfigError as error:
             raise ConfigError(f"strength is {strength}, too much: {error}") from error
 
