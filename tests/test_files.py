@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import csv
+import hashlib
 import json
 import math
 from pathlib import Path
 
 import pytest
 
-from vusfa.errors import ConfigError
-from vusfa.files import plain_cell, replacing, write_csv, write_json
+from vusfa.errors import ConfigError, SceneError
+from vusfa.files import file_sha256, plain_cell, replacing, write_csv, write_json
 
 
 def test_a_failure_leaves_the_old_file_and_nothing_else(tmp_path: Path):
@@ -72,3 +73,11 @@ def test_names_move_no_cursor(tmp_path: Path, name: str):
     ):
         assert "\\" in text
         assert not set(text) & set("\x1b\x07\x9b\u202e\udce9\r")
+
+
+def test_the_hash_of_a_file(tmp_path: Path) -> None:
+    content = bytes(range(256)) * 9000
+    (tmp_path / "f").write_bytes(content)
+    assert file_sha256(tmp_path / "f") == hashlib.sha256(content).hexdigest()
+    with pytest.raises(SceneError, match="cannot be read"):
+        file_sha256(tmp_path / "g")

@@ -92,7 +92,7 @@ def test_torchrl_asks_whether_a_reset_resumes_episodes() -> None:
 def test_no_other_file_names_them(room: str) -> None:
     private = re.compile(
         r"_new_unsafe|_set_str|\b_step_mdp|_step_and_maybe_reset|_supports_set_state|__dict__\["
-        r"|\._carrier|_weight_sync_schemes"
+        r"|\._carrier|_weight_sync_schemes|_get_default_store"
     )
     files = sorted((PACKAGE / room).rglob("*.py"))
     assert files

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import csv
+import hashlib
 import io
 import json
 import math
@@ -19,11 +20,12 @@ from typing import Any
 
 import numpy as np
 
-from vusfa.errors import ConfigError, ResultError, printable
+from vusfa.errors import ConfigError, ResultError, SceneError, printable
 
 __all__ = [
     "cannot_write",
     "check_folder",
+    "file_sha256",
     "plain_cell",
     "remove_leftovers",
     "replacing",
@@ -58,6 +60,19 @@ def check_folder(path: str | Path, setting: str) -> Path:
     if not os.access(nearest, os.W_OK | os.X_OK):
         raise ConfigError(f"{setting} is {str(path)!r}, but {nearest} may not be written; give another")
     return Path(path)
+
+
+def file_sha256(path: str | os.PathLike[str]) -> str:
+    """SHA-256 of a file's bytes, in hexadecimal.
+
+    Raises:
+        SceneError: the file cannot be read.
+    """
+    try:
+        with open(path, "rb") as file:
+            return hashlib.file_digest(file, "sha256").hexdigest()
+    except OSError as error:
+        raise SceneError(f"{path}: cannot be read ({error}); check the path") from error
 
 
 @contextlib.contextmanager

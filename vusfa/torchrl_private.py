@@ -1,4 +1,4 @@
-"""Every private name of TorchRL and TensorDict that this package uses; no other file names any.
+"""Every private name of TorchRL, TensorDict and torch that this package uses; no other file names any.
 
 ``TensorDict._new_unsafe``
     saves 10 to 12 % of the environment's processor time (16 and 128 rows);
@@ -15,6 +15,9 @@
     are the threads that share weights with workers. Left to the garbage collector, they end when the
     interpreter does, which then waits forever; the public way, ``BaseCollector.shutdown``, leaves them
     running.
+``torch.distributed.distributed_c10d._get_default_store``
+    is the store of the process group, where ranks leave signs of life; the public way is a store of one's
+    own, on a port that all ranks would have to agree on.
 
 ``tests/test_torchrl_private.py`` fails when a new TorchRL changes one of them.
 """
@@ -25,7 +28,7 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
-from torch import Tensor
+from torch import Tensor, distributed
 from torchrl.envs import EnvBase
 
 if TYPE_CHECKING:
@@ -35,6 +38,7 @@ __all__ = [
     "StatelessEnv",
     "carrier",
     "end_weight_sharing",
+    "process_group_store",
     "put_carrier",
     "unchecked_tensordict",
 ]
@@ -48,8 +52,6 @@ def carrier(collector: Collector) -> TensorDict:
 def put_carrier(collector: Collector, content: dict[str, Any]) -> None:
     """Make a collector step on from what :func:`carrier` gave, as nested dictionaries of tensors."""
     before = collector._carrier
-    if "step_count" in content and "elapsed_steps" in before:  # its name in checkpoints of version 0.1
-        content = {("elapsed_steps" if key == "step_count" else key): value for key, value in content.items()}
     collector._carrier = TensorDict(content, batch_size=before.batch_size, device=before.device)
 
 
@@ -57,6 +59,11 @@ def end_weight_sharing(collector: BaseCollector) -> None:
     """End the threads that share weights with a collector's workers."""
     for scheme in (collector._weight_sync_schemes or {}).values():
         scheme.shutdown()
+
+
+def process_group_store() -> Any:
+    """The key-value store of the process group that :func:`torch.distributed.init_process_group` has made."""
+    return distributed.distributed_c10d._get_default_store()
 
 
 def unchecked_tensordict(

@@ -62,5 +62,5 @@ def test_a_file_system_without_locks_refuses_nobody(tmp_path: Path, monkeypatch:
         raise OSError(95, "Operation not supported")
 
     monkeypatch.setattr("vusfa.cluster.locks.fcntl.flock", flock)
-    with FileLock(tmp_path / "lock"):
-        pass
+    with FileLock(tmp_path / "lock"), FileLock(tmp_path / "lock"):
+        assert (tmp_path / "lock").exists()

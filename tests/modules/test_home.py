@@ -145,10 +145,13 @@ def test_names_in_place_of_scenes(hall: SceneSet) -> None:
             use()
 
 
-def test_what_is_no_agent_is_not_judged(attic: SceneSet) -> None:
+def test_what_is_no_agent_is_not_judged(attic: SceneSet, hall: SceneSet) -> None:
+    agent = make_agent("gvf", scenes=hall, **SMALL)
     for policy in (None, torch.nn.Linear(1, 1), lambda data: data, "modules"):
         check_home(policy, attic)
     check_home(torch.nn.Linear(1, 1), None)
+    with pytest.raises(ConfigError, match="made for"):
+        check_home(torch.nn.Sequential(torch.nn.Linear(1, 1), agent), attic)
 
 
 def test_many_scenes_make_a_short_message(hall: SceneSet, make_scene: Callable[..., Scene]) -> None:
@@ -164,3 +167,4 @@ def test_the_fingerprint_is_computed_once(hall: SceneSet, monkeypatch: pytest.Mo
     monkeypatch.setattr("hashlib.sha256", None)
     check_home(agent, copy)
     check_home(agent, hall.to("cpu"))
+    assert copy.fingerprint == agent.config["fingerprint"]

@@ -146,13 +146,6 @@ def test_places_after_a_move() -> None:
     assert centre(1.0, np.pi / 6, np.zeros(2))[1] == pytest.approx(20 - 10, abs=1.0)
 
 
-def test_blur_is_a_mean_of_neighbours() -> None:
-    row = np.zeros((1, 9, 3), np.float32)
-    row[0, 4] = 6
-    assert augment._blurred(row, 3)[0, :, 0].tolist() == pytest.approx([0, 0, 0, 2, 2, 2, 0, 0, 0])
-    assert augment._blurred(row, 1) is row
-
-
 def test_values_out_of_range() -> None:
     with pytest.raises(ConfigError, match="jpeg is 0; give a number between 1 and 95"):
         Augmentation(jpeg=0)

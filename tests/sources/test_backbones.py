@@ -14,11 +14,11 @@ import torch
 from torch import nn
 
 from vusfa.errors import ConfigError
+from vusfa.files import file_sha256
 from vusfa.sources.backbones import LITE0_SHA256, Backbone, load_backbone
 from vusfa.sources.crops import Preprocessing, prepare
 from vusfa.sources.encode import encode_pictures
 from vusfa.sources.layers import Patches
-from vusfa.sources.row_log import file_sha256
 
 
 class Tiny(nn.Module):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +10,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from vusfa.errors import SceneError
-from vusfa.sources.row_log import RowLog, file_sha256
+from vusfa.sources.row_log import RowLog
 
 PAIR = np.dtype((np.float32, (2, 3)))
 
@@ -98,11 +97,3 @@ def test_a_folder_that_is_not_there(tmp_path: Path) -> None:
     log.path = tmp_path  # a folder
     with pytest.raises(SceneError, match="cannot be written"):
         log.append(rows(0, 1))
-
-
-def test_the_hash_of_a_file(tmp_path: Path) -> None:
-    content = bytes(range(256)) * 9000
-    (tmp_path / "f").write_bytes(content)
-    assert file_sha256(tmp_path / "f") == hashlib.sha256(content).hexdigest()
-    with pytest.raises(SceneError, match="cannot be read"):
-        file_sha256(tmp_path / "g")

@@ -14,10 +14,10 @@ import torch
 from torch import nn
 
 from vusfa.errors import ConfigError
+from vusfa.files import file_sha256
 from vusfa.sources.backbones import load_backbone
 from vusfa.sources.crops import Preprocessing, prepare
 from vusfa.sources.encode import encode_pictures
-from vusfa.sources.row_log import file_sha256
 from vusfa.sources.transformers_folder import patch_tokens
 
 PICTURES = np.random.default_rng(0).integers(0, 256, (2, 30, 40, 3), np.uint8)

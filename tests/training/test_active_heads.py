@@ -11,6 +11,7 @@ import pytest
 import torch
 from omegaconf import OmegaConf
 
+from tests.training.few_scenes import SMALL
 from vusfa.errors import ConfigError
 from vusfa.modules import make_agent, pretrain_autoencoder
 from vusfa.objectives import TFRMSprop
@@ -19,16 +20,6 @@ from vusfa.training import Trainer, make_trainer
 from vusfa.training.active_heads import ActiveHeads
 
 SIZES = {"hidden_size": 8, "embedding_size": 8, "history": 1}
-SMALL = [f"agent.{name}={value}" for name, value in SIZES.items()] + [
-    "env.goals=random:2",
-    "env.active_scenes=2",
-    "env.scene_stay=96",
-    "env.max_steps=6",
-    "collector.num_envs=6",
-    "collector.rollout=4",
-    "scenes=[bathroom]",
-    "autocast=false",
-]
 
 
 @pytest.fixture

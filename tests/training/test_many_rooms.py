@@ -12,6 +12,7 @@ import pytest
 import torch
 from omegaconf import OmegaConf
 
+from tests.training.few_scenes import SMALL
 from vusfa.errors import ConfigError, SceneError
 from vusfa.evaluation import evaluate
 from vusfa.evaluation.exact import exact_goals
@@ -20,19 +21,6 @@ from vusfa.experiments.validation import Validation
 from vusfa.modules import InferencePolicy, TabularPolicy, make_agent
 from vusfa.scenes import Scene, SceneSet
 from vusfa.training import Trainer, make_loggers, make_trainer
-
-SMALL = [
-    *(f"agent.{name}=8" for name in ("hidden_size", "embedding_size")),
-    "agent.history=1",
-    "env.goals=random:2",
-    "env.active_scenes=2",
-    "env.scene_stay=96",
-    "env.max_steps=6",
-    "collector.num_envs=6",
-    "collector.rollout=4",
-    "scenes=[bathroom]",
-    "autocast=false",
-]
 
 
 @pytest.fixture
@@ -98,7 +86,13 @@ def test_numbers_are_those_of_rooms_in_memory_and_a_resumed_run_goes_on(
 
 def test_workers_read_what_they_need(made: Callable[..., Trainer], fast_workers: None) -> None:
     trainer = made("collector=multi_sync", "collector.num_workers=2", "env.goal_sampling=episode")
+    before = [value.clone() for value in trainer.agent.state_dict().values()]
     run(trainer, 3)
+    assert trainer.frames == 3 * 6 * 4
+    assert any(
+        not torch.equal(old, new)
+        for old, new in zip(before, trainer.agent.state_dict().values(), strict=True)
+    )
 
 
 def test_a_store_that_vanishes_ends_the_run_with_its_name(made: Callable[..., Trainer], rooms: Path) -> None:

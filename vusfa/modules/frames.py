@@ -18,7 +18,27 @@ from vusfa.scenes.features import LazyFeatures, SceneRows
 __all__ = ["FeatureFrames", "PictureFrames", "shrink_pictures"]
 
 
-class FeatureFrames(nn.Module):
+class _Frames(nn.Module):
+    """Base: a table of all states, or rows that are read when they are asked for."""
+
+    table: Tensor
+    _rows: SceneRows | None
+
+    @property
+    def num_states(self) -> int:
+        """S, or 0 without a table."""
+        return len(self.table) if self._rows is None else self._rows.num_states
+
+    @property
+    def is_lazy(self) -> bool:
+        """Whether rows are read when they are asked for."""
+        return self._rows is not None
+
+    def _all(self, ids: Tensor | None) -> Tensor:
+        return torch.arange(self.num_states, device=self.table.device) if ids is None else ids
+
+
+class FeatureFrames(_Frames):
     """Precomputed features of frames: a table of all states that stays out of the ``state_dict``.
 
     The table holds crop 0, in evaluation mode always; :meth:`show` puts other crops in its place for
@@ -42,7 +62,6 @@ class FeatureFrames(nn.Module):
     """
 
     frame_dims = 1
-    table: Tensor
     mean: Tensor
     deviation: Tensor
     _converted: Tensor | None
@@ -64,22 +83,12 @@ class FeatureFrames(nn.Module):
             if self._features is None:
                 mean, spread, largest = table.mean(0), table.std(0, correction=0), table.abs().amax(0)
             else:
-                mean, spread, largest = (column.to(table) for column in self._features.summary.columns)
+                mean, spread, largest = (column.to(table) for column in self._features.summary[1:])
             self.register_buffer("mean", mean)
             self.register_buffer("deviation", _deviation(spread, largest, len(features)))
             # Kept as the encoder wants it, and brought up to date when other numbers are loaded.
             self.table = (self.table - self.mean) / self.deviation
             self._register_load_state_dict_pre_hook(self._renormalize)
-
-    @property
-    def num_states(self) -> int:
-        """S, or 0 without a table."""
-        return len(self.table) if self._rows is None else self._rows.num_states
-
-    @property
-    def is_lazy(self) -> bool:
-        """Whether rows are read when they are asked for."""
-        return self._rows is not None
 
     def lookup(self, ids: Tensor | None) -> Tensor:
         """Features (\\*B, F) of states (\\*B,) int64; of all S states in order for ``None``.
@@ -87,7 +96,7 @@ class FeatureFrames(nn.Module):
         Under autocast the table is converted once, because it is constant.
         """
         if self._rows is not None:
-            return for_autocast(self._rows(_all_of(self, ids), self._read))
+            return for_autocast(self._rows(self._all(ids), self._read))
         table, device = self.table, self.table.device.type
         if self._shown is not None and self.training:
             table = self._shown
@@ -150,7 +159,7 @@ class FeatureFrames(nn.Module):
                 self._rows.clear()
 
 
-class PictureFrames(nn.Module):
+class PictureFrames(_Frames):
     """Features learned from pictures by three convolutions, the paper's variant "from scratch".
 
     Pictures are shrunk to ``picture_size``. Convolutions of 32 filters 8 x 8 by 4, 64 of 4 x 4 by 2 and 64 of
@@ -170,7 +179,6 @@ class PictureFrames(nn.Module):
     """
 
     frame_dims = 3
-    table: Tensor
 
     def __init__(self, pictures: Tensor | SceneSet | None, picture_size: tuple[int, int] = (60, 80)) -> None:
         super().__init__()
@@ -198,16 +206,6 @@ class PictureFrames(nn.Module):
         height, width = (((side - 8) // 4 + 1 - 4) // 2 + 1 - 2 for side in self.picture_size)
         self.size = 64 * height * width
 
-    @property
-    def num_states(self) -> int:
-        """S, or 0 without a table."""
-        return len(self.table) if self._rows is None else self._rows.num_states
-
-    @property
-    def is_lazy(self) -> bool:
-        """Whether pictures are read when they are asked for."""
-        return self._rows is not None
-
     def _read(self, scene: int) -> Tensor:
         """Pictures (N, 3, H, W) of a scene in the size that the convolutions see."""
         assert self._scenes is not None
@@ -217,7 +215,7 @@ class PictureFrames(nn.Module):
     def lookup(self, ids: Tensor | None) -> Tensor:
         """Features (\\*B, F) of states (\\*B,) int64; of all S states in order for ``None``."""
         if self._rows is not None:
-            return self.encode(self._rows(_all_of(self, ids), self._read))
+            return self.encode(self._rows(self._all(ids), self._read))
         return self.encode(self.table if ids is None else self.table[ids])
 
     def encode(self, observation: Tensor) -> Tensor:
@@ -227,10 +225,6 @@ class PictureFrames(nn.Module):
         # Centred, so that a dark picture and a light one start equally far from nothing.
         pixels = small.to(next(self.convolutions.parameters()).dtype)
         return self.convolutions(pixels / 127.5 - 1).view(*batch, self.size)
-
-
-def _all_of(frames: FeatureFrames | PictureFrames, ids: Tensor | None) -> Tensor:
-    return torch.arange(frames.num_states, device=frames.table.device) if ids is None else ids
 
 
 def _deviation(deviation: Tensor, largest: Tensor, num_states: int) -> Tensor:

@@ -102,10 +102,10 @@ def _opened_within(encoded: bytes, shape: tuple[int, ...] | None) -> Iterator[Im
         yield image
 
 
-def to_jpeg(picture: np.ndarray) -> bytes:
-    """A picture (H, W, 3) uint8 as a JPEG file of quality 92."""
+def to_jpeg(picture: np.ndarray, quality: int = _QUALITY) -> bytes:
+    """A picture (H, W, 3) uint8 as a JPEG file, of quality 92 by default."""
     buffer = io.BytesIO()
-    Image.fromarray(picture).save(buffer, "JPEG", quality=_QUALITY)
+    Image.fromarray(picture).save(buffer, "JPEG", quality=quality)
     return buffer.getvalue()
 
 

@@ -18,8 +18,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from vusfa.errors import ResultError, SceneError
-from vusfa.files import write_npz
+from vusfa.errors import ResultError
+from vusfa.files import file_sha256, write_npz
 from vusfa.reading import read_npz
 
 if TYPE_CHECKING:
@@ -41,11 +41,6 @@ class FeatureSummary(NamedTuple):
     mean: Tensor
     deviation: Tensor
     largest: Tensor
-
-    @property
-    def columns(self) -> tuple[Tensor, Tensor, Tensor]:
-        """Mean, deviation and largest absolute value."""
-        return self.mean, self.deviation, self.largest
 
 
 def fingerprint(scenes: Sequence[Scene]) -> str:
@@ -113,11 +108,7 @@ def _computed(scenes: Sequence[Scene]) -> FeatureSummary:
 
 def _sha256(path: Path) -> np.ndarray:
     """(32,) uint8."""
-    try:
-        with open(path, "rb") as file:
-            return np.frombuffer(hashlib.file_digest(file, "sha256").digest(), np.uint8)
-    except OSError as error:
-        raise SceneError(f"{path}: cannot be read ({error}); check the path and its permissions") from error
+    return np.frombuffer(bytes.fromhex(file_sha256(path)), np.uint8)
 
 
 def _read(path: Path, scenes: int, features: int) -> dict[str, np.ndarray] | None:

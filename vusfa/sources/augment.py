@@ -6,7 +6,6 @@ scene, training draws one at each step (``env.crop=random``).
 
 from __future__ import annotations
 
-import io
 import math
 import os
 from collections.abc import Sequence
@@ -17,13 +16,14 @@ import numpy as np
 from PIL import Image
 
 from vusfa.errors import ConfigError, SceneError
+from vusfa.files import file_sha256
 from vusfa.scenes import store
-from vusfa.scenes.pictures import decode, read_pictures
+from vusfa.scenes.pictures import decode, read_pictures, to_jpeg
 from vusfa.scenes.scene import Scene
 from vusfa.scenes.validation import check_same_graph
 from vusfa.sources.backbones import DEFAULT, Backbone, load_backbone
+from vusfa.sources.blur import motion_blur
 from vusfa.sources.encode import Progress, encode_in_steps
-from vusfa.sources.row_log import file_sha256
 
 __all__ = ["Augmentation", "augment_picture", "augment_scene"]
 
@@ -109,13 +109,13 @@ def augment_picture(
     moved *= np.exp(draw(-limits.brightness, limits.brightness)) * np.array([1 + warmth, 1, 1 - warmth])
     mean = moved.mean()
     moved = mean + (moved - mean) * np.exp(draw(-limits.contrast, limits.contrast))
-    moved = _blurred(moved, round(draw(0, limits.blur) * picture.shape[1]))
+    length = round(draw(0, limits.blur) * picture.shape[1])
+    if length > 1:
+        moved = motion_blur(moved, length, length // 2).astype(np.float32)
     _erase(moved, draw(0, limits.erase, 2), draw(0, 1, 2))
     moved += generator.normal(0, draw(0, limits.noise), moved.shape)
-    buffer = io.BytesIO()
     quality = round(draw(limits.jpeg, _BEST_QUALITY))
-    Image.fromarray(moved.clip(0, 255).round().astype(np.uint8)).save(buffer, "JPEG", quality=quality)
-    return decode(buffer.getvalue())
+    return decode(to_jpeg(moved.clip(0, 255).round().astype(np.uint8), quality))
 
 
 def _moved(picture: np.ndarray, scale: float, angle: float, shift: np.ndarray) -> np.ndarray:
@@ -130,15 +130,6 @@ def _moved(picture: np.ndarray, scale: float, angle: float, shift: np.ndarray) -
         (width, height), Image.Transform.AFFINE, (cos, sin, x, -sin, cos, y), Image.Resampling.BILINEAR
     )
     return np.asarray(found)
-
-
-def _blurred(values: np.ndarray, length: int) -> np.ndarray:
-    """Means over ``length`` pixels of each row."""
-    if length < 2:
-        return values
-    wide = np.pad(values, ((0, 0), (length // 2, length - 1 - length // 2), (0, 0)), "edge")
-    sums = np.cumsum(np.pad(wide, ((0, 0), (1, 0), (0, 0))), axis=1, dtype=np.float64)
-    return ((sums[:, length:] - sums[:, :-length]) / length).astype(np.float32)
 
 
 def _erase(values: np.ndarray, size: np.ndarray, place: np.ndarray) -> None:

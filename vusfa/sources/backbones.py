@@ -32,11 +32,11 @@ import torch
 from torch import Tensor, nn
 
 from vusfa.errors import ConfigError
+from vusfa.files import file_sha256
 from vusfa.limits import one_line
 from vusfa.reading import BoundedZip
 from vusfa.sources.crops import Preprocessing
 from vusfa.sources.layers import Features, Patches, UpTo
-from vusfa.sources.row_log import file_sha256
 from vusfa.sources.transformers_folder import PATCHES, POOLED, is_transformers_folder, open_folder
 
 __all__ = ["DEFAULT", "LITE0_SHA256", "Backbone", "load_backbone"]

@@ -17,6 +17,7 @@ import torch
 from torch import Tensor
 
 from vusfa.errors import ConfigError, SceneError
+from vusfa.files import file_sha256
 from vusfa.limits import TABLE_STATES
 from vusfa.scenes import store
 from vusfa.scenes.graph import default_actions, shortest_path_distances
@@ -25,7 +26,7 @@ from vusfa.scenes.scene import Scene
 from vusfa.scenes.validation import array_faults, feature_faults, raise_faults
 from vusfa.sources.backbones import DEFAULT, Backbone, load_backbone
 from vusfa.sources.crops import prepare
-from vusfa.sources.row_log import RowLog, file_sha256
+from vusfa.sources.row_log import RowLog
 
 __all__ = ["bfloat16_is_as_good", "encode_in_steps", "encode_pictures", "encode_scene"]
 

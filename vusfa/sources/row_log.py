@@ -17,27 +17,12 @@ from typing import Any
 
 import numpy as np
 
+from vusfa.deprecated import moved_names
 from vusfa.errors import SceneError
 
-__all__ = ["RowLog", "file_sha256"]
+__all__ = ["RowLog"]
 
 _MAGIC = b"vusfa row log 1\n"
-
-
-def file_sha256(path: str | os.PathLike[str]) -> str:
-    """SHA-256 of a file's bytes, in hexadecimal.
-
-    Raises:
-        SceneError: the file cannot be read.
-    """
-    digest = hashlib.sha256()
-    try:
-        with open(path, "rb") as file:
-            while block := file.read(1 << 20):
-                digest.update(block)
-    except OSError as error:
-        raise SceneError(f"{path}: cannot be read ({error}); check the path") from error
-    return digest.hexdigest()
 
 
 class RowLog:
@@ -138,3 +123,6 @@ class RowLog:
     def remove(self) -> None:
         """Delete the file."""
         self.path.unlink(missing_ok=True)
+
+
+__getattr__ = moved_names(__name__, {"file_sha256": "vusfa.files.file_sha256"})

@@ -15,10 +15,10 @@ from typing import Any
 from torch import Tensor, nn
 
 from vusfa.errors import ConfigError
+from vusfa.files import file_sha256
 from vusfa.limits import MAX_PICTURE_SIDE
 from vusfa.reading import read_json
 from vusfa.sources.crops import Preprocessing
-from vusfa.sources.row_log import file_sha256
 
 __all__ = ["PATCHES", "POOLED", "Tower", "is_transformers_folder", "open_folder"]
 

@@ -36,6 +36,7 @@ from torchrl.collectors import BaseCollector
 
 from vusfa.errors import ConfigError, RankError, VusfaError
 from vusfa.limits import brief
+from vusfa.torchrl_private import process_group_store
 from vusfa.training.content import restore
 from vusfa.training.ranks import Ranks, check_ranks, merged, share
 
@@ -120,9 +121,8 @@ class ProcessRanks(Ranks):
         self._limit, wait = limit, timedelta(seconds=limit)
         self._host: Any = distributed.new_group(backend="gloo", timeout=wait)
         self._device: Any = distributed.new_group(backend="nccl", timeout=wait) if cuda else self._host
-        # the store has no public name; torchrun's outlives the ranks
-        store: Any = distributed.distributed_c10d._get_default_store()
-        self._store: Any = distributed.PrefixStore("vusfa", store)
+        # torchrun's store outlives the ranks
+        self._store: Any = distributed.PrefixStore("vusfa", process_group_store())
         self._steps = self._turns = 0
         self._is_broken, self._stopped = False, 0
         self._left = threading.Event()

@@ -160,8 +160,9 @@ def merged(parts: list[dict[str, Any]], size: int, algorithm: Callable[[list[Any
     whole["collector"] = {**collectors[0], "batch_size": list(rows.batch_size), "carrier": rows.to_dict()}
     meters = [part["meter"]["episodes"] for part in parts]
     sums = {name: torch.stack([meter[name] for meter in meters]).sum(0) for name in meters[0]}
-    totals = {name: meters[0][name] for name in ("totals",) if name in sums}  # rank 0 has those of all
-    whole["meter"] = {**parts[0]["meter"], "episodes": {**sums, **totals}}
+    if "totals" in sums:  # rank 0 has those of all
+        sums["totals"] = meters[0]["totals"]
+    whole["meter"] = {**parts[0]["meter"], "episodes": sums}
     draws = [{name: each[name] for name in ("env", "generator")} for each in collectors]
     return {**whole, "ranks": [{"rng": part["rng"], **each} for part, each in zip(parts, draws, strict=True)]}
 

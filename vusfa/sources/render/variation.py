@@ -6,7 +6,6 @@ and evaluated in it. The exposure is that of the unvaried room: dimmer lamps mak
 
 from __future__ import annotations
 
-import io
 import math
 import os
 from collections.abc import Iterator
@@ -14,11 +13,12 @@ from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
 import numpy as np
-from PIL import Image
 
 from vusfa.errors import SceneError
 from vusfa.limits import MAX_STATES
 from vusfa.reading import read_text
+from vusfa.scenes.pictures import decode, to_jpeg
+from vusfa.sources.blur import motion_blur
 from vusfa.sources.render.catalogue import Catalogue
 from vusfa.sources.render.grid import Poses, poses
 from vusfa.sources.render.outline import overlaps
@@ -236,12 +236,5 @@ def vary_picture(picture: np.ndarray, variation: Variation) -> np.ndarray:
     """
     length = round(variation.blur * picture.shape[1])
     if length > 1:
-        before = length // 2
-        padded = np.pad(picture, ((0, 0), (length - 1 - before, before), (0, 0)), mode="edge")
-        windows = np.lib.stride_tricks.sliding_window_view(padded, length, axis=1)
-        picture = (windows.mean(axis=-1) + 0.5).astype(np.uint8)
-    if variation.jpeg is not None:
-        file = io.BytesIO()
-        Image.fromarray(picture).save(file, "JPEG", quality=variation.jpeg)
-        picture = np.asarray(Image.open(file))
-    return picture
+        picture = (motion_blur(picture, length, length - 1 - length // 2) + 0.5).astype(np.uint8)
+    return picture if variation.jpeg is None else decode(to_jpeg(picture, variation.jpeg))
