@@ -14,8 +14,14 @@ import torchrl
 
 import vusfa
 
-__all__ = ["describe_machine", "foreign_load"]
+__all__ = ["AVX2", "describe_machine", "foreign_load"]
 
+#: Environment that limits torch, oneDNN and MKL to AVX2.
+AVX2 = {
+    "ONEDNN_MAX_CPU_ISA": "AVX2",
+    "ATEN_CPU_CAPABILITY": "avx2",
+    "MKL_ENABLE_INSTRUCTIONS": "AVX2",
+}
 _FLAGS = ("avx2", "avx512f", "avx512_bf16", "amx_bf16", "amx_int8")
 
 
@@ -23,7 +29,7 @@ def describe_machine() -> dict[str, Any]:
     """Processor, memory, accelerator, versions and the commit, as plain data.
 
     >>> sorted(describe_machine())[:4]
-    ['commit', 'cores', 'cpu', 'cpu_flags']
+    ['capability', 'commit', 'cores', 'cpu']
     """
     model, flags = _cpu()
     return {
@@ -39,6 +45,7 @@ def describe_machine() -> dict[str, Any]:
         "vusfa": vusfa.__version__,
         "commit": _commit(),
         "threads": torch.get_num_threads(),
+        "capability": torch.backends.cpu.get_cpu_capability(),
     }
 
 

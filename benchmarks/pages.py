@@ -2,7 +2,8 @@
 
 Each FILE that ``benchmarks/run.py`` wrote is taken over into results/benchmarks, one file per suite, with the
 machine's description reduced to what the page shows. Then every suite becomes docs/generated/speed-SUITE.md;
-one without a file there says that it has not been measured.
+one without a file there says that it has not been measured. A suite that was measured with --avx2, too, has a
+second table, speed-SUITE-avx2.md.
 """
 
 from __future__ import annotations
@@ -43,12 +44,15 @@ def take_over(path: Path, results: Path) -> list[Path]:
         content = json.loads(path.read_text(encoding="utf-8"))
         quick, suites = content["options"]["quick"], content["suites"]
         machine = {name: content["machine"][name] for name in FACTS}
+        ending = "-avx2" * content["options"].get("avx2", False)
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise ConfigError(f"{path}: is no report of benchmarks/run.py ({error})") from error
     if quick:
         raise ConfigError(f"{path}: was written with --quick, and its numbers mean nothing; measure in full")
     return [
-        write_json(results / f"{suite['suite']}.json", {**content, "machine": machine, "suites": [suite]})
+        write_json(
+            results / f"{suite['suite']}{ending}.json", {**content, "machine": machine, "suites": [suite]}
+        )
         for suite in suites
         if not suite["skipped"]
     ]
@@ -58,7 +62,7 @@ def documents(results: Path) -> dict[str, str]:
     """The tables of all suites, from a folder of reports, Markdown, by the names of their files."""
     return {
         f"speed-{suite}.md": f"<!-- {COMMAND} -->\n\n{document(results / f'{suite}.json')}\n"
-        for suite in MODULES
+        for suite in [*MODULES, *sorted(path.stem for path in results.glob("*-avx2.json"))]
     }
 
 
@@ -68,9 +72,11 @@ def document(path: Path) -> str:
         return f"Not measured with this version: `python benchmarks/run.py --suite {path.stem}` does."
     content, (report,) = json.loads(path.read_text(encoding="utf-8")), read_reports(path)
     machine = content["machine"]
+    limited = "; torch, oneDNN and MKL limited to AVX2" * content["options"].get("avx2", False)
     parts = [
         f"`{_command(report.suite, content['options'])}`",
-        f"{describe(machine)}. Other programs kept {machine['foreign_load']} cores busy at the start.",
+        f"{describe(machine)}{limited}. "
+        f"Other programs kept {machine['foreign_load']} cores busy at the start.",
         "\n".join(_rows(report.rows)),
     ]
     notes = dict.fromkeys(f"- {row.name}: {row.note}" for row in report.rows if row.note)
@@ -85,6 +91,7 @@ def _command(suite: str, options: dict[str, Any]) -> str:
     for name in ("repetitions", "seconds", "threads", "cap"):
         if options[name] != getattr(Options(), name):
             words.append(f"--{name} {options[name]:g}")
+    words += ["--avx2"] * options.get("avx2", False)
     return " ".join([*words, *(f"--set {override}" for override in options["overrides"])])
 
 

@@ -1,6 +1,6 @@
 """Updates with ``autocast=auto`` beside ``true`` and ``false``, on this processor and without bfloat16 units.
 
-The latter is an imitation: in a separate process torch and oneDNN may use AVX2 alone. It multiplies as a
+The latter is an imitation: in a separate process torch, oneDNN and MKL may use AVX2 alone. It multiplies as a
 processor without such units does; clock and memory are still this machine's.
 """
 
@@ -14,14 +14,13 @@ from contextlib import ExitStack
 from dataclasses import astuple
 from pathlib import Path
 
+from benchmarks.machine import AVX2
 from benchmarks.report import Options, Report, Requirement, Row
 from benchmarks.timing import Sample, Timing, Work, interleaved, ratio
 from benchmarks.trainer import running, small
 
-__all__ = ["AVX2", "run"]
+__all__ = ["run"]
 
-#: Environment that limits torch and oneDNN to AVX2.
-AVX2 = {"ONEDNN_MAX_CPU_ISA": "AVX2", "ATEN_CPU_CAPABILITY": "avx2"}
 SETTINGS = ("auto", "true", "false")
 
 

@@ -26,6 +26,7 @@ class Options:
         threads: threads of torch, in measurements on two cores.
         cap: seconds after which a training counts as not solving the task.
         overrides: settings of the recipe that are not its default ones.
+        avx2: torch may use AVX2 alone, an imitation of a processor without bfloat16 units.
     """
 
     quick: bool = False
@@ -34,6 +35,7 @@ class Options:
     threads: int = 2
     cap: float = 900.0
     overrides: tuple[str, ...] = ()
+    avx2: bool = False
 
 
 @dataclass(frozen=True)

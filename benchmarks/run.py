@@ -1,12 +1,14 @@
 """Measure the library beside its alternatives: python benchmarks/run.py --suite train
 
-Needs the extra ``bench``. Writes OUT/SUITE.json and prints tables; each requirement is a line, PASS or FAIL.
-The exit code is 1 when a requirement fails, except with --quick, whose numbers mean nothing.
+Needs the extra ``bench``. Writes OUT/SUITE.json, with --avx2 OUT/SUITE-avx2.json, and prints tables; each
+requirement is a line, PASS or FAIL. The exit code is 1 when a requirement fails, except with --quick, whose
+numbers mean nothing.
 """
 
 from __future__ import annotations
 
 import multiprocessing
+import os
 import sys
 from dataclasses import replace
 from enum import StrEnum
@@ -19,7 +21,7 @@ from rich.console import Console
 
 sys.path.insert(0, str(Path(__file__).parents[1]))  # a script's own folder is there, not the one above
 
-from benchmarks.machine import describe_machine, foreign_load
+from benchmarks.machine import AVX2, describe_machine, foreign_load
 from benchmarks.report import Options, Report, write_reports
 from benchmarks.table import print_machine, print_report
 from vusfa.training.memory import keep_memory
@@ -78,9 +80,12 @@ def main(
     change: Annotated[
         list[str] | None, typer.Option("--set", help="a recipe's setting: autocast=true")
     ] = None,
+    avx2: Annotated[bool, typer.Option(help="imitate a processor that has AVX2 alone")] = False,
 ) -> None:
     """Measure, print and write down."""
-    options = Options(quick, repetitions, seconds, threads, cap, tuple(change or ()))
+    if avx2 and not AVX2.items() <= os.environ.items():  # read by the libraries when they are loaded
+        os.execve(sys.executable, sys.orig_argv, {**os.environ, **AVX2})
+    options = Options(quick, repetitions, seconds, threads, cap, tuple(change or ()), avx2)
     if quick:
         options = replace(options, repetitions=1, seconds=0.0)
     keep_memory()  # as in the recipes, and for the peers, too
@@ -93,7 +98,7 @@ def main(
     reports = measure(suite.value, options)
     for report in reports:
         print_report(report, console, quick)
-    path = write_reports(out / f"{suite.value}.json", machine, options, reports)
+    path = write_reports(out / f"{suite.value}{'-avx2' * avx2}.json", machine, options, reports)
     console.print(f"written: {path}", soft_wrap=True)
     failed = any(not line.passed for report in reports for line in report.requirements)
     raise typer.Exit(1 if failed and not quick else 0)

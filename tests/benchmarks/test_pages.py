@@ -41,10 +41,11 @@ def test_the_page_shows_what_was_measured() -> None:
 
 def test_every_committed_report_is_a_full_one_of_a_suite_with_no_more_of_the_machine_than_needed() -> None:
     paths = sorted(RESULTS.glob("*"))
-    assert {path.stem for path in paths} <= set(MODULES)
+    assert {path.stem.removesuffix("-avx2") for path in paths} <= set(MODULES)
     for path in paths:
         content = json.loads(path.read_text(encoding="utf-8"))
-        assert [suite["suite"] for suite in content["suites"]] == [path.stem]
+        assert [suite["suite"] for suite in content["suites"]] == [path.stem.removesuffix("-avx2")]
+        assert content["options"].get("avx2", False) == path.stem.endswith("-avx2")
         assert not content["options"]["quick"]
         assert set(content["machine"]) == set(FACTS)
         assert "/work" not in path.read_text(encoding="utf-8")
@@ -72,6 +73,18 @@ def test_a_report_is_taken_over_without_its_system_and_shown_with_its_failures(t
         "Not measured with this version: `python benchmarks/run.py --suite gpu`"
         in documents(tmp_path)["speed-gpu.md"]
     )
+
+
+def test_a_measurement_that_was_limited_to_avx2_stands_beside_the_other(tmp_path: Path) -> None:
+    machine = {**describe_machine(), "foreign_load": 0.0}
+    results = tmp_path / "results"
+    for options in (Options(), Options(avx2=True)):
+        take_over(write_reports(tmp_path / "eval.json", machine, options, [REPORT]), results)
+    made = documents(results)
+    assert "limited" not in made["speed-eval.md"]
+    assert "`python benchmarks/run.py --suite eval --avx2`" in made["speed-eval-avx2.md"]
+    assert "; torch, oneDNN and MKL limited to AVX2. Other programs" in made["speed-eval-avx2.md"]
+    assert "speed-env-avx2.md" not in made
 
 
 def test_a_quick_or_foreign_file_is_refused(tmp_path: Path) -> None:

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import json
 import math
+import os
 import re
+import subprocess
+import sys
 from importlib import import_module
 from pathlib import Path
 
@@ -92,6 +96,18 @@ def test_the_command_writes_a_file(tmp_path: Path):
     assert report.suite == "eval"
     assert any(re.search("zero-shot evaluation, .*one episode at a time", row.name) for row in report.rows)
     assert all(row.value > 0 and (row.ratio is None or row.ratio > 0) for row in report.rows)
+
+
+@pytest.mark.skipif(
+    torch.backends.cpu.get_cpu_capability() not in ("AVX2", "AVX512"), reason="a processor without AVX2"
+)
+def test_a_processor_without_bfloat16_is_imitated_in_a_process_of_its_own(tmp_path: Path):
+    script = Path(__file__).parents[2] / "benchmarks" / "run.py"
+    command = [sys.executable, str(script), "--suite", "gpu", "--quick", "--avx2", "--out", str(tmp_path)]
+    subprocess.run(command, check=True, capture_output=True, env={**os.environ, "CUDA_VISIBLE_DEVICES": ""})
+    content = json.loads((tmp_path / "gpu-avx2.json").read_text())
+    assert content["options"]["avx2"]
+    assert content["machine"]["capability"] == "AVX2"
 
 
 def test_time_of_checks_does_not_count_and_the_cap_does():
