@@ -8,7 +8,8 @@ from contextlib import ExitStack
 import torch
 
 from benchmarks.report import Options, Report, Requirement, Row
-from benchmarks.solve_suite import checker, solve_row, train_until
+from benchmarks.solve_checks import check_of_trainer
+from benchmarks.solve_suite import solve_row, train_until
 from benchmarks.timing import Work, interleaved
 from benchmarks.trainer import Running, running, small
 
@@ -38,11 +39,10 @@ def run(options: Options) -> Report:
             best = max(best, timing.per_second)
     with running(base) as ours:
         trainer = ours.trainer
-        scenes = trainer.scenes.to("cuda")
-        check = checker(trainer.actor, scenes, trainer.goals, trainer.agent.config["history"], options)
+        check = check_of_trainer(trainer, options)
         cap, every = (0.5, 0.5) if options.quick else (options.cap, 5.0)
         outcome = train_until(_synchronised(ours), check, cap, every, trainer.settings["total_frames"])
-    report.rows.append(solve_row("vusfa on the GPU", outcome))
+    report.rows.append(solve_row("vusfa on the GPU", [outcome]))
     report.requirements.append(Requirement("training on one GPU", best, FRAMES, "frames/s"))
     what = "time to solve on one GPU"
     report.requirements.append(Requirement(what, outcome.seconds, SECONDS, "s", at_least=False))

@@ -10,8 +10,10 @@ from __future__ import annotations
 import multiprocessing
 import os
 import sys
+from collections.abc import Callable
 from dataclasses import replace
 from enum import StrEnum
+from functools import partial
 from importlib import import_module
 from pathlib import Path
 from typing import Annotated
@@ -63,10 +65,24 @@ GROUPS = {"train": ("collect", "update", "solve", "memory"), "all": tuple(MODULE
 BUSY = 0.2
 
 
-def measure(suite: str, options: Options) -> list[Report]:
-    """Run the modules of a suite."""
-    names = [name for part in GROUPS.get(suite, (suite,)) for name in MODULES[part]]
-    return [import_module(f"benchmarks.{name}").run(options) for name in names]
+def measure(suite: str, options: Options, keep: Callable[[list[Report]], object]) -> list[Report]:
+    """Run the modules of a suite.
+
+    Args:
+        suite: a name of :class:`Suite`.
+        options: of the measurement.
+        keep: gets the reports so far after every module, and after every training of the time to solve: what
+            a measurement that is interrupted leaves.
+    """
+    reports: list[Report] = []
+    for name in [name for part in GROUPS.get(suite, (suite,)) for name in MODULES[part]]:
+        module = import_module(f"benchmarks.{name}")
+        if name == "solve_suite":
+            reports.append(module.run(options, lambda part: keep([*reports, part])))
+        else:
+            reports.append(module.run(options))
+        keep(reports)
+    return reports
 
 
 def main(
@@ -76,7 +92,9 @@ def main(
     threads: Annotated[int, typer.Option(min=1, help="threads of torch, on two cores")] = 2,
     repetitions: Annotated[int, typer.Option(min=1, help="turns of each workload")] = 5,
     seconds: Annotated[float, typer.Option(min=0.0, help="length of a turn")] = 1.0,
-    cap: Annotated[float, typer.Option(min=0.0, help="seconds that a training may take to solve")] = 900.0,
+    cap: Annotated[
+        float, typer.Option(min=0.0, help="seconds of a training to solve, with its checks")
+    ] = 900.0,
     change: Annotated[
         list[str] | None, typer.Option("--set", help="a recipe's setting: autocast=true")
     ] = None,
@@ -95,10 +113,10 @@ def main(
     print_machine(machine, console)
     if machine["foreign_load"] > BUSY:
         console.print(f"other programs keep {machine['foreign_load']} cores busy: timings are doubtful")
-    reports = measure(suite.value, options)
+    path = out / f"{suite.value}{'-avx2' * avx2}.json"
+    reports = measure(suite.value, options, partial(write_reports, path, machine, options))
     for report in reports:
         print_report(report, console, quick)
-    path = write_reports(out / f"{suite.value}{'-avx2' * avx2}.json", machine, options, reports)
     console.print(f"written: {path}", soft_wrap=True)
     failed = any(not line.passed for report in reports for line in report.requirements)
     raise typer.Exit(1 if failed and not quick else 0)

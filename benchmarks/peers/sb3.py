@@ -22,7 +22,7 @@ from vusfa.conf.settings import MAX_STEPS
 from vusfa.envs import resolve_goals
 from vusfa.scenes import SceneSet
 
-__all__ = ["SceneVecEnv", "SiameseExtractor", "make_sb3", "sb3_actions"]
+__all__ = ["SceneVecEnv", "SiameseExtractor", "make_sb3", "sb3_actions", "sb3_probabilities"]
 
 
 class SceneVecEnv(VecEnv):
@@ -177,3 +177,15 @@ def sb3_actions(model: Any, ids: dict[str, Tensor]) -> Tensor:
     table: SceneVecEnv = model.get_env()
     observation = table._look_up({key: value.numpy() for key, value in ids.items()})
     return torch.from_numpy(model.predict(observation, deterministic=False)[0])
+
+
+@torch.no_grad()
+def sb3_probabilities(model: Any, state: Tensor, goal: Tensor, scene: Tensor) -> Tensor:
+    """Probabilities (n, A) of a trained model's actions for ids (n,), of one frame each; for our exact
+    evaluation."""
+    table: SceneVecEnv = model.get_env()
+    ids = {"state_id": state.unsqueeze(-1), "goal_id": goal, "scene_id": scene}
+    observation = table._look_up({key: value.numpy() for key, value in ids.items()})
+    model.policy.set_training_mode(False)
+    tensors, _ = model.policy.obs_to_tensor(observation)
+    return model.policy.get_distribution(tensors).distribution.probs
