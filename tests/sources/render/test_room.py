@@ -215,6 +215,24 @@ def test_ctrl_c_within_a_frame_stops_or_leaves_it_whole() -> None:
         signal.signal(signal.SIGINT, before)
 
 
+@pytest.mark.parametrize("signaled", [KeyboardInterrupt(), SystemExit(143)])
+def test_a_signal_within_the_compiler_is_no_error_of_it(signaled: BaseException) -> None:
+    catalogue = Catalogue.open()
+    plan = TINY.completed(catalogue)
+    mi = load_mitsuba(Backend("scalar_rgb"))
+    renderer = Renderer(mi, build_scene(mi, plan, catalogue), plan.camera)
+
+    def layers(*_: Any) -> None:
+        raise RuntimeError("FlatVariables::assign(): error encountered") from signaled
+
+    renderer._layers = layers
+    with pytest.raises(type(signaled)):
+        renderer.frame(0.3, 0.3, 90.0, 0)
+    renderer._layers = lambda *_: 1 / 0
+    with pytest.raises(ZeroDivisionError):
+        renderer.frame(0.3, 0.3, 90.0, 0)
+
+
 @pytest.mark.parametrize("scalar", [False, True])
 def test_pictures_do_not_depend_on_the_threads(scalar: bool) -> None:
     import drjit

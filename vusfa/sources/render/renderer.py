@@ -111,7 +111,12 @@ class Renderer:
 
         self._values["to_world"] = self._pose(x, z, heading)
         self._values.update()
-        layers = np.array(self._layers(self._scene, self._sensor, self._opaque(seed)))
+        try:
+            layers = np.array(self._layers(self._scene, self._sensor, self._opaque(seed)))
+        except RuntimeError as error:
+            if isinstance(error.__cause__, KeyboardInterrupt | SystemExit):  # a signal within Dr.Jit
+                raise error.__cause__ from None
+            raise
         if not self._recorded:
             import drjit
 
