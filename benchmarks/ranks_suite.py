@@ -24,8 +24,8 @@ from benchmarks.timing import Work, interleaved
 from benchmarks.trainer import Running, recipe_settings, running
 from vusfa.scenes import Scene, SceneSet
 from vusfa.training import make_trainer
-from vusfa.training.distributed import joined
 from vusfa.training.ranks import Ranks
+from vusfa.training.rendezvous import joined
 
 __all__ = ["run"]
 

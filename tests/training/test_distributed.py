@@ -12,8 +12,8 @@ from vusfa.algorithms.experience import merge_graphs
 from vusfa.errors import ConfigError, RankError
 from vusfa.objectives.returns import _normalize, _normalize_together
 from vusfa.training import StopOnSignal
-from vusfa.training.distributed import joined
 from vusfa.training.ranks import Ranks, check_ranks, merged, settings_of_rank, share
+from vusfa.training.rendezvous import joined
 
 
 def settings(name: str = "usf", **changes: Any) -> dict[str, Any]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,7 +20,7 @@ from vusfa.evaluation.navigation import evaluate
 from vusfa.evaluation.starts import Unreachable, episode_starts
 from vusfa.evaluation.summary import count_pairs, random_walk_summary, summary
 from vusfa.files import write_csv, write_json
-from vusfa.limits import MAX_EPISODE_STEPS
+from vusfa.limits import MAX_EPISODE_STEPS, MAX_EPISODES, brief
 from vusfa.scenes import SceneSet
 
 __all__ = ["Comparison", "check_comparison", "compare"]
@@ -94,10 +94,15 @@ def check_comparison(
         episode_starts(scenes, ids, 1, unreachable=unreachable, generator=torch.Generator())
     except GoalError as error:
         raise GoalError(f"evaluation: {error}") from error
+    if len(ids) * episodes_per_goal > MAX_EPISODES:
+        raise ConfigError(
+            f"evaluation: episodes_per_goal is {brief(episodes_per_goal)} for {len(ids)} goals; give at most"
+            f" {MAX_EPISODES:,} episodes in all"
+        )
 
 
 def compare(
-    policies: dict[str, TensorDictModuleBase],
+    policies: Mapping[str, TensorDictModuleBase | Episodes],
     scenes: SceneSet,
     goals: Any,
     *,
@@ -109,7 +114,7 @@ def compare(
     """Evaluate policies on the same episodes, beside the random walk and the shortest path.
 
     Args:
-        policies: by name; the episodes of the first are kept.
+        policies: by name; the episodes of the first are kept. In place of one its episodes, walked before.
         scenes: the world.
         goals: global state ids, or whatever :func:`vusfa.envs.goals.resolve_goals` takes.
         trained: global ids of the goals that the first policy was trained on.
@@ -126,7 +131,9 @@ def compare(
     tables: list[Episodes] = []
     for name, policy in policies.items():
         named_progress = None if progress is None else _named(progress, name)
-        table = evaluate(policy, scenes, goal_ids, trained=trained, progress=named_progress, **settings)
+        table = policy
+        if not isinstance(table, Episodes):
+            table = evaluate(table, scenes, goal_ids, trained=trained, progress=named_progress, **settings)
         rows += summary(table, name, within)
         tables.append(table)
     unreachable = settings.get("unreachable", "skip")

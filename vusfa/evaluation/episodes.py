@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
@@ -67,6 +67,15 @@ class Episodes:
 
     def __len__(self) -> int:
         return self.scene.shape[0]
+
+    @classmethod
+    def joined(cls, tables: Sequence[Episodes]) -> Episodes:
+        """One table of several of the same world and limit, one after the other."""
+        first, *_ = tables
+        columns: dict[str, Any] = {
+            name: torch.cat([getattr(each, name) for each in tables]) for name in first.columns
+        }
+        return replace(first, **columns)
 
     def select(self, rows: Tensor) -> Episodes:
         """The episodes where ``rows`` (n,) bool is set."""

@@ -29,12 +29,17 @@ __all__ = [
     "ExpectedWalks",
     "exact_goals",
     "expected_walks",
+    "join_walks",
     "sampled_walks",
     "uniform_probabilities",
+    "walks_within",
 ]
 
 #: From ids of states, goals and scenes, (R,) each, to the probabilities (R, A) of the actions.
 Probabilities = Callable[[Tensor, Tensor, Tensor], Tensor]
+#: Of goals of one scene: its index, columns (6, G) of :class:`ExpectedWalks`, and (2, N) the sums of
+#: ``from_start`` over them, and their number.
+WalksWithin = tuple[int, Tensor, Tensor]
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,25 +127,44 @@ def expected_walks(
     True
     """
     probabilities = probabilities or uniform_probabilities(scenes.num_actions)
-    parts, summed = [], torch.zeros(2, scenes.num_states, dtype=torch.float64)
     scene_of = scenes.scene_id.to(goals.device)[goals]
-    for index in scene_of.unique().tolist():
-        scene, first = scenes.scenes[index], int(scenes.offsets[index])
-        here = goals[scene_of == index] - first
-        for block, chance, shortest, arrival in _distributions(probabilities, scenes, index, here, max_steps):
-            steps = torch.arange(chance.shape[1], dtype=torch.float64)[:, None]
-            ways = torch.arange(chance.shape[2], dtype=torch.float64)
-            success = chance.sum((1, 2))
-            arrived = (chance * steps).sum((1, 2))
-            length = arrived + max_steps * (1 - success)
-            spl = (chance * (ways / torch.maximum(steps, ways).clamp(min=1))).sum((1, 2))
-            parts.append((length, success, arrived, (chance * ways).sum((1, 2)), shortest, spl))
-            starts = scene.distances_to(block) > 0
-            summed[:, first : first + scene.num_states] += torch.stack(
-                [(arrival * starts).sum(0), starts.sum(0)]
-            )
-    columns = [torch.cat(column) for column in zip(*parts, strict=True)]
-    return ExpectedWalks._make([*columns, summed[0] / summed[1]])
+    parts = [goals[scene_of == index] for index in scene_of.unique().tolist()]
+    return join_walks([walks_within(probabilities, scenes, part, max_steps) for part in parts], scenes)
+
+
+@torch.no_grad()
+def walks_within(
+    probabilities: Probabilities, scenes: SceneSet, goals: Tensor, max_steps: int = MAX_STEPS
+) -> WalksWithin:
+    """:func:`expected_walks` to goals (G,), one or more, of one scene, as :func:`join_walks` takes them.
+
+    >>> rooms, goals = SceneSet.bundled(["bathroom"]), torch.tensor([3, 90])
+    >>> parts = [walks_within(uniform_probabilities(4), rooms, part) for part in goals.split(1)]
+    >>> torch.equal(join_walks(parts, rooms).spl, expected_walks(None, rooms, goals).spl)
+    True
+    """
+    index = int(scenes.scene_id[goals[0]])
+    scene, here, parts = scenes.scenes[index], goals - int(scenes.offsets[index]), []
+    sums = torch.zeros(2, scene.num_states, dtype=torch.float64)
+    for block, chance, shortest, arrival in _distributions(probabilities, scenes, index, here, max_steps):
+        steps = torch.arange(chance.shape[1], dtype=torch.float64)[:, None]
+        ways = torch.arange(chance.shape[2], dtype=torch.float64)
+        success = chance.sum((1, 2))
+        arrived = (chance * steps).sum((1, 2))
+        length = arrived + max_steps * (1 - success)
+        spl = (chance * (ways / torch.maximum(steps, ways).clamp(min=1))).sum((1, 2))
+        parts.append(torch.stack([length, success, arrived, (chance * ways).sum((1, 2)), shortest, spl]))
+        starts = scene.distances_to(block) > 0
+        sums += torch.stack([(arrival * starts).sum(0), starts.sum(0)])
+    return index, torch.cat(parts, 1), sums
+
+
+def join_walks(parts: Sequence[WalksWithin], scenes: SceneSet) -> ExpectedWalks:
+    """The walks to the goals of all parts, one after the other."""
+    summed = torch.zeros(2, scenes.num_states, dtype=torch.float64)
+    for index, _, sums in parts:
+        summed[:, int(scenes.offsets[index]) : int(scenes.offsets[index + 1])] += sums
+    return ExpectedWalks._make([*torch.cat([columns for _, columns, _ in parts], 1), summed[0] / summed[1]])
 
 
 def sampled_walks(episodes: Episodes, scenes: SceneSet, goals: Tensor) -> ExpectedWalks:

@@ -48,6 +48,7 @@ def evaluate(
     batch_size: int = 4096,
     observe: Observe | None = None,
     progress: Progress | None = None,
+    by_scene: bool = False,
 ) -> Episodes:
     """Roll out ``episodes_per_goal`` episodes to every goal.
 
@@ -69,6 +70,7 @@ def evaluate(
         batch_size: episodes in parallel.
         observe: adds ``observation`` and ``goal_observation`` for a policy that reads these.
         progress: called with (finished episodes, all episodes) after every step.
+        by_scene: walk in a few scenes at a time, as always where features stay in files.
 
     Raises:
         ConfigError: the policy's agent was made for other scenes.
@@ -88,11 +90,9 @@ def evaluate(
             generator=generator,
         )
     limits: dict[str, Any] = {"max_steps": max_steps, "history": history, "batch_size": batch_size}
-    with acting(policy, scenes, sample, seed):
-        if scenes.is_lazy:
-            walked = _walk_by_scene(policy, scenes, start, goal, progress, observe=observe, **limits)
-        else:
-            walked = walk(policy, scenes, start, goal, observe=observe, progress=progress, **limits)
+    walks = _walk_by_scene if (by_scene or scenes.is_lazy) and len(goal) else walk
+    with acting(policy, scenes, sample, seed, by_scene):
+        walked = walks(policy, scenes, start, goal, observe=observe, progress=progress, **limits)
     success, length, collisions, end = walked
     marked = torch.zeros(scenes.num_states, dtype=torch.bool)
     if trained is not None:
@@ -117,9 +117,9 @@ def _walk_by_scene(
     scenes: SceneSet,
     start: Tensor,
     goal: Tensor,
-    progress: Progress | None,
     *,
     batch_size: int,
+    progress: Progress | None,
     **options: Any,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """As :func:`walk`, in a few scenes at a time: at most ``batch_size`` episodes, or one scene. Of these
@@ -197,9 +197,7 @@ def walk(
         for key, value in memory.items():
             batch.set(key, value)
         batch.set("is_init", steps == 0)
-        if observe is not None:
-            batch = observe(batch)
-        batch = policy(batch)
+        batch = policy(batch if observe is None else observe(batch))
         action = batch.get("action")
         end = step(scenes.successor, scenes.blocked, rewards, max_steps, frames, goal[row], steps, action)
         frames, steps = end.state_id, end.elapsed_steps
@@ -276,13 +274,15 @@ def caching(policy: nn.Module, scenes: SceneSet | None = None, goals: Tensor | N
 
 
 @contextmanager
-def acting(policy: nn.Module, scenes: SceneSet, sample: bool = True, seed: int = 0) -> Iterator[None]:
+def acting(
+    policy: nn.Module, scenes: SceneSet, sample: bool = True, seed: int = 0, by_scene: bool = False
+) -> Iterator[None]:
     """Evaluation mode, cached inference policies and an own random state; all restored afterwards.
 
     Args:
         policy: a policy, or an agent.
         scenes: on its device.
-        sample, seed: see :func:`evaluate`.
+        sample, seed, by_scene: see :func:`evaluate`.
     """
     check_home(policy, scenes)
     modes = [(module, module.training) for module in policy.modules()]
@@ -291,7 +291,7 @@ def acting(policy: nn.Module, scenes: SceneSet, sample: bool = True, seed: int =
     exploration = ExplorationType.RANDOM if sample else ExplorationType.DETERMINISTIC
     try:
         with torch.random.fork_rng(devices), set_exploration_type(exploration), ExitStack() as stack:
-            if not scenes.is_lazy:  # else of a few scenes at a time
+            if not (by_scene or scenes.is_lazy):  # else of a few at a time
                 stack.enter_context(caching(policy))
             torch.manual_seed(seed)
             yield

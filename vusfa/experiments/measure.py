@@ -11,9 +11,18 @@ import torch
 from tensordict.nn import TensorDictModuleBase
 
 from vusfa.evaluation import Episodes, evaluate
-from vusfa.evaluation.exact import ExpectedWalks, Probabilities, exact_goals, expected_walks, sampled_walks
+from vusfa.evaluation.exact import (
+    ExpectedWalks,
+    Probabilities,
+    WalksWithin,
+    exact_goals,
+    join_walks,
+    sampled_walks,
+    walks_within,
+)
 from vusfa.evaluation.metrics import get_metric
 from vusfa.evaluation.navigation import acting
+from vusfa.evaluation.parts import evaluate_parts, parts_of
 from vusfa.experiments.manifest import BUNDLED_MANIFEST, Manifest, make_manifest, read_manifest
 from vusfa.experiments.runs import Run
 from vusfa.modules import Agent, InferencePolicy, TabularPolicy
@@ -134,6 +143,8 @@ def measure_goals(
 ) -> ExpectedWalks:
     """How an agent in training reaches goals, actions sampled; weights and random states stay as they are.
 
+    The ranks of a data-parallel training all call this, and share the goals out.
+
     Args:
         trainer: of the agent.
         goals: (G,) global ids, scene by scene.
@@ -141,51 +152,54 @@ def measure_goals(
             that read ids are measured exactly.
         max_steps: limit of actions per episode.
     """
-    agent, device = trainer.agent, next(trainer.agent.parameters()).device
+    agent, ranks, device = trainer.agent, trainer.ranks, next(trainer.agent.parameters()).device
     scenes = trainer.scenes.to(device)
+    parts = parts_of(scenes, goals, episodes_per_goal)
     if agent.is_tabular:
-        with acting(agent, scenes):
-            if scenes.is_lazy:
-                return expected_walks(probabilities_by_scene(agent, scenes, goals), scenes, goals, max_steps)
-            table = TabularPolicy(agent, scenes, goals)
-        return expected_walks(
-            lambda *ids: table.probabilities(*(each.to(device) for each in ids)).cpu(),
-            scenes,
-            goals,
-            max_steps,
-        )
+        exact = [_exactly(agent, scenes, part, max_steps) for part in parts[ranks.own_parts]]
+        found = ranks.collect(exact)
+        return ranks.first(lambda: join_walks(found, scenes))
     with evaluation_precision(agent, trainer.settings):
-        episodes = evaluate(
+        tables = evaluate_parts(
             InferencePolicy(agent),
             scenes,
-            goals,
+            parts,
+            ranks.own_parts,
             episodes_per_goal=episodes_per_goal,
             max_steps=max_steps,
             history=agent.config["history"],
             observe=trainer.observation,
         )
-    return sampled_walks(episodes, scenes, goals)
+    walked = ranks.collect(tables)
+    return ranks.first(lambda: sampled_walks(Episodes.joined(walked), scenes, goals))
 
 
-def probabilities_by_scene(
-    agent: Agent, scenes: SceneSet, goals: torch.Tensor | None = None
-) -> Probabilities:
+def _exactly(agent: Agent, scenes: SceneSet, goals: torch.Tensor, max_steps: int) -> WalksWithin:
+    with acting(agent, scenes):
+        table = TabularPolicy(agent, scenes, goals)
+    return walks_within(
+        lambda *ids: table.probabilities(*(each.to(scenes.device) for each in ids)).cpu(),
+        scenes,
+        goals,
+        max_steps,
+    )
+
+
+def probabilities_by_scene(agent: Agent, scenes: SceneSet) -> Probabilities:
     """Probabilities of a one-frame agent's actions, of which the table of one scene at a time is kept.
 
     Args:
         agent: as it is now.
         scenes: on its device.
-        goals: (G,) global ids of the only goals to come; None for all states.
     """
-    every = torch.arange(scenes.num_states) if goals is None else goals.cpu()
-    scene_of = scenes.scene_id.cpu()[every]
     latest: dict[int, TabularPolicy] = {}
 
     def probabilities(state: torch.Tensor, goal: torch.Tensor, scene: torch.Tensor) -> torch.Tensor:
         index = int(scene[0])
         if index not in latest:
             latest.clear()
-            latest[index] = TabularPolicy(agent, scenes, every[scene_of == index])
+            goals = torch.arange(int(scenes.offsets[index]), int(scenes.offsets[index + 1]))
+            latest[index] = TabularPolicy(agent, scenes, goals)
         ids = (each.to(scenes.device) for each in (state, goal, scene))
         return latest[index].probabilities(*ids).cpu()
 

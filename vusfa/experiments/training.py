@@ -13,7 +13,10 @@ from omegaconf import DictConfig, OmegaConf
 
 from vusfa.conf.compose import compose
 from vusfa.conf.schema import register_schema
-from vusfa.evaluation import Comparison, check_comparison, compare, print_summary
+from vusfa.envs import resolve_goals
+from vusfa.errors import RankError
+from vusfa.evaluation import Comparison, Episodes, check_comparison, compare, print_summary
+from vusfa.evaluation.parts import evaluate_parts, parts_of
 from vusfa.experiments.measure import measure_goals
 from vusfa.experiments.validation import Draw, Validation
 from vusfa.files import say
@@ -29,10 +32,10 @@ from vusfa.training import (
     run_training,
     set_threads,
 )
-from vusfa.training.distributed import joined
 from vusfa.training.folder import AUTO, CHECKPOINT, found_checkpoint
 from vusfa.training.precision import describe_autocast
 from vusfa.training.ranks import Ranks
+from vusfa.training.rendezvous import joined
 from vusfa.training.scene_files import settings_seen_from
 from vusfa.training.setup import decide_autocast
 from vusfa.training.trackers import sweep_run_id
@@ -72,7 +75,7 @@ def train(settings: Mapping[str, Any], overrides: Sequence[str] = (), draw: Draw
     """Train, and leave metrics, checkpoints and an evaluation in ``settings["folder"]`` (that of the
     trainer's settings where the caller's are null). The last lines say where, and whether a random walk does
     better. Where the environment names several ranks (torchrun), this process is one of them, see
-    :mod:`vusfa.training.distributed`; the first leaves the files.
+    :mod:`vusfa.training.rendezvous`; the first leaves the files.
 
     Args:
         settings: as in vusfa/conf/train.yaml, resolved.
@@ -140,11 +143,11 @@ def _train(plain: dict[str, Any], overrides: Sequence[str], draw: Draw | None, r
                 validation = Validation(trainer, loggers, draw)
             run_training(trainer, path, loggers, stop, progress, converged, validation)
         loggers.exit_code = stop.exit_code
-        comparison = None
+        stopped = ranks.first(lambda: stop.received)
+        comparison = _evaluate(trainer, path) if evaluated and not stopped else None
         if not ranks.is_first:
             return Trained(trainer, None, stop.exit_code)
-        if evaluated and not stop.received:
-            comparison = _evaluate(trainer)
+        if comparison is not None:
             comparison.save(place / "evaluation")
             loggers.log_table("evaluation", comparison.rows, trainer.frames)
             with suppress(BrokenPipeError):
@@ -174,17 +177,33 @@ def _evaluation(trainer: Trainer) -> dict[str, Any]:
     return {**chosen, "goals": trainer.goals if chosen["goals"] == "trained" else chosen["goals"]}
 
 
-def _evaluate(trainer: Trainer) -> Comparison:
-    with EvaluationProgress() as progress:
-        return compare(
-            {row_name(trainer.settings): trainer.actor},
-            trainer.scenes,
-            trained=trainer.goals,
-            progress=progress,
-            history=trainer.agent.config["history"],
-            observe=trainer.observation,
-            **_evaluation(trainer),
-        )
+def _evaluate(trainer: Trainer, checkpoint: Path) -> Comparison | None:
+    """The evaluation at the end, shared out among ranks; on rank 0."""
+    name, scenes, ranks = row_name(trainer.settings), trainer.scenes, trainer.ranks
+    chosen = _evaluation(trainer)
+    goals = chosen.pop("goals")
+    parts = parts_of(scenes, resolve_goals(scenes, goals), chosen["episodes_per_goal"])
+    try:
+        with EvaluationProgress() as progress:
+            own = evaluate_parts(
+                trainer.acting,
+                scenes,
+                parts,
+                ranks.own_parts,
+                trained=trainer.goals,
+                progress=partial(progress, name),
+                history=trainer.agent.config["history"],
+                observe=trainer.observation,
+                **chosen,
+            )
+            tables = ranks.collect(own)
+    except RankError as error:
+        error.args = (f"{error}; the agent is in {checkpoint}: evaluate it",)
+        raise
+    if not ranks.is_first:
+        return None
+    chosen |= {"history": trainer.agent.config["history"]}
+    return compare({name: Episodes.joined(tables)}, scenes, goals, trained=trainer.goals, **chosen)
 
 
 def _plain(value: Any) -> Any:

@@ -90,7 +90,7 @@ class Validation:
         Args:
             is_last: whether the training ends here.
         """
-        if self._is_due(is_last):
+        if self._trainer.ranks.first(lambda: self._is_due(is_last)):
             return self.measure()
         if not self._columns:
             walks = torch.zeros(7, len(self.goals), dtype=torch.float64)
@@ -98,10 +98,13 @@ class Validation:
         return dict.fromkeys(self._columns, math.nan)
 
     def measure(self) -> dict[str, float]:
-        """Metrics of the agent as it is now, logged as a table and media, too."""
+        """Metrics of the agent as it is now, logged as a table and media, too; all ranks call it."""
         began, trainer = time.monotonic(), self._trainer
         walks = measure_goals(trainer, self.goals, episodes_per_goal=EPISODES, max_steps=self.max_steps)
-        self.latest = self._metrics(walks)
+        return trainer.ranks.first(lambda: self._logged(walks, began))
+
+    def _logged(self, walks: ExpectedWalks, began: float) -> dict[str, float]:
+        trainer, self.latest = self._trainer, self._metrics(walks)
         self._loggers.log_table("validation", self._rows(walks), trainer.frames)
         self._spent("", began)
         is_last = trainer.frames >= trainer.settings["total_frames"]

@@ -4,7 +4,8 @@
 ``r * B`` to ``(r + 1) * B`` of the ``collector.num_envs`` environments, with B = num_envs / N, in all scenes.
 It collects and differentiates for itself, in the environments and with the draws that worker r of
 ``collector=multi_sync`` has: N ranks make the updates of one process with N such workers, to the rounding of
-sums. Agent, optimizer and multiplier are the same on all ranks; rank 0 logs, evaluates and saves.
+sums. Agent, optimizer and multiplier are the same on all ranks. Evaluations are shared out; rank 0 logs and
+saves.
 
 ``DistributedDataParallel`` was looked at and left: it averages what the ``forward`` of one module has used,
 and here losses run parts of actor and critic in their own way. One all-reduce of all gradients, flat, sends
@@ -17,13 +18,12 @@ the message can name the one that is gone.
 
 from __future__ import annotations
 
-import json
 import os
 import signal
 import socket
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from datetime import timedelta
 from pathlib import Path
@@ -34,77 +34,17 @@ import torch
 from torch import Tensor, distributed, nn
 from torchrl.collectors import BaseCollector
 
-from vusfa.errors import ConfigError, RankError, VusfaError
-from vusfa.limits import brief
+from vusfa.errors import RankError, VusfaError
 from vusfa.torchrl_private import process_group_store
 from vusfa.training.content import restore
-from vusfa.training.ranks import Ranks, check_ranks, merged, share
+from vusfa.training.ranks import Ranks, merged, share
 
-__all__ = ["ProcessRanks", "joined"]
+__all__ = ["ProcessRanks"]
 
-#: Variables that a launcher sets, such as torchrun or Ray Train.
-VARIABLES = ("RANK", "WORLD_SIZE", "MASTER_ADDR", "MASTER_PORT")
 #: Seconds between signs of life, and without any before a rank is called dead once something is wrong.
 BEAT, MISSED = 1.0, 3.0
-#: Seconds for all ranks to find each other; and for a ``collector.timeout`` of null.
-START, NEVER = 120.0, 1e6
-
-
-@contextmanager
-def joined(settings: Mapping[str, Any], environ: Mapping[str, str] = os.environ) -> Iterator[Ranks]:
-    """Context in which this process is one of the ranks that the environment's variables describe.
-
-    A process group that is initialized already (Ray Train's) is used, and left as it is.
-
-    Args:
-        settings: of the training, the same on all ranks.
-        environ: with :data:`VARIABLES`, and ``LOCAL_RANK``, the GPU's number where ``device=cuda``; where
-            they are missing, this process is alone.
-
-    Raises:
-        ConfigError: settings that ranks cannot share (on rank 0; a RankError on the others), or variables
-            that are no numbers.
-        RankError: the ranks do not find each other.
-    """
-    if any(not environ.get(name) for name in VARIABLES):
-        yield Ranks()
-        return
-    numbers = {name: environ.get(name, "0") for name in (*VARIABLES, "LOCAL_RANK") if name != "MASTER_ADDR"}
-    for name, text in numbers.items():
-        if not (text.isascii() and text.isdecimal() and len(text) < 10):
-            raise ConfigError(f"the environment's {name} is {brief(text)}; torchrun sets it to a number")
-    rank, size = int(numbers["RANK"]), int(numbers["WORLD_SIZE"])
-    if rank >= max(size, 1):
-        raise ConfigError(f"the environment's RANK is {rank}; of {size} ranks the last is {size - 1}")
-    if size < 2:
-        yield Ranks()
-        return
-    try:
-        check_ranks(settings, size)
-    except VusfaError as error:  # all ranks find the same
-        raise error if rank == 0 else RankError(f"rank 0: {error}", is_quiet=True) from error
-    cuda = str(settings["device"]).startswith("cuda")
-    if cuda and torch.cuda.is_available():
-        torch.cuda.set_device(int(environ.get("LOCAL_RANK", 0)))
-    limit, found = settings["collector"].get("timeout") or NEVER, distributed.is_initialized()
-    try:
-        if not found:
-            backend, wait = "cpu:gloo,cuda:nccl" if cuda else "gloo", timedelta(seconds=START)
-            distributed.init_process_group(backend, rank=rank, world_size=size, timeout=wait)
-        ranks = ProcessRanks(rank, size, limit, cuda)
-    except (RuntimeError, ValueError) as error:
-        where, reason = f"{environ['MASTER_ADDR']}:{environ['MASTER_PORT']}", str(error).split("\n")[0]
-        raise RankError(f"rank {rank} of {size} does not find the others at {where} ({reason})") from error
-    try:
-        yield ranks
-        ranks.leave("")
-    except BaseException as error:
-        ranks.leave("" if isinstance(error, RankError) else str(error) or type(error).__name__)
-        raise
-    finally:
-        if not found:
-            with suppress(RuntimeError):  # of connections that are broken
-                distributed.destroy_process_group()
+#: Seconds for a ``collector.timeout`` of null, and for waits as long as the others give signs of life.
+NEVER = 1e6
 
 
 class ProcessRanks(Ranks):
@@ -120,11 +60,11 @@ class ProcessRanks(Ranks):
         super().__init__(rank, size)
         self._limit, wait = limit, timedelta(seconds=limit)
         self._host: Any = distributed.new_group(backend="gloo", timeout=wait)
+        self._patient: Any = distributed.new_group(backend="gloo", timeout=timedelta(seconds=NEVER))
         self._device: Any = distributed.new_group(backend="nccl", timeout=wait) if cuda else self._host
         # torchrun's store outlives the ranks
         self._store: Any = distributed.PrefixStore("vusfa", process_group_store())
-        self._steps = self._turns = 0
-        self._is_broken, self._stopped = False, 0
+        self._steps, self._is_broken, self._stopped = 0, False, 0
         self._left = threading.Event()
         self._store.set(f"who{rank}", f"rank {rank} (process {os.getpid()} on {socket.gethostname()})")
         self._beat()
@@ -186,22 +126,34 @@ class ProcessRanks(Ranks):
 
     def first(self, call: Callable[[], Any]) -> Any:
         """The others wait for as long as rank 0 gives signs of life."""
-        self._turns += 1
-        key, before, since = f"turn{self._turns}", b"", time.monotonic()
-        if self.is_first:
-            result = call()
-            if not self._is_broken:
-                self._store.set(key, json.dumps(result))
-            return result
+        found = [call() if self.is_first else None]
         with self._watched():
-            while not self._store.check([key]):
-                beat = self._store.get("beat0")
-                if beat != before:
-                    before, since = beat, time.monotonic()
-                if time.monotonic() - since > self._limit or self._store.check(["left0"]):
-                    raise RuntimeError("rank 0 does not answer")
-                time.sleep(0.02)
-            return json.loads(self._store.get(key))
+            self._meet()
+            distributed.broadcast_object_list(found, 0, group=self._host)
+        return found[0]
+
+    def collect(self, own: list[Any]) -> list[Any]:
+        """Pickled, to processes of the same program."""
+        with self._watched():
+            self._meet()
+        found = self.gather(own)
+        return [found[part % self.size][part // self.size] for part in range(sum(map(len, found)))]
+
+    def _meet(self) -> None:
+        """Wait for all ranks. A connection that breaks ends it at once, and so does a silent rank: each
+        watches over the next."""
+        work: Any = distributed.all_reduce(torch.zeros(1), group=self._patient, async_op=True)
+        other, before, since, looked = (self.rank + 1) % self.size, b"", time.monotonic(), 0.0
+        while not work.is_completed():
+            time.sleep(0.002)
+            if time.monotonic() - looked < BEAT:
+                continue
+            looked, beat = time.monotonic(), self._store.get(f"beat{other}")
+            if beat != before:
+                before, since = beat, looked
+            if looked - since > self._limit or self._store.check([f"left{other}"]):
+                raise RuntimeError(f"rank {other} does not answer")
+        work.wait()
 
     @contextmanager
     def preparing(self) -> Iterator[None]:
@@ -213,6 +165,7 @@ class ProcessRanks(Ranks):
             mine = error
         found: list[str | None] = [None] * self.size
         with self._watched():
+            self._meet()
             distributed.all_gather_object(found, None if mine is None else str(mine), group=self._host)
         failed = next((rank for rank, message in enumerate(found) if message is not None), None)
         if mine is not None and failed == self.rank:

@@ -75,7 +75,8 @@ class Ranks:
         rank, size: this one's number, from 0 on, and how many there are.
 
     Attributes:
-        is_first: whether this is rank 0, which logs, evaluates and saves.
+        is_first: whether this is rank 0, which logs and saves.
+        own_parts: which parts of a work are this rank's: part i is that of rank i mod N.
         signal: gives the number of a signal that this rank has received, or None.
 
     >>> ranks = Ranks()
@@ -85,6 +86,7 @@ class Ranks:
 
     def __init__(self, rank: int = 0, size: int = 1) -> None:
         self.rank, self.size, self.is_first = rank, size, rank == 0
+        self.own_parts = slice(rank, None, size)
         self.signal: Callable[[], int | None] = lambda: None
 
     @property
@@ -110,8 +112,17 @@ class Ranks:
         return [state]
 
     def first(self, call: Callable[[], Any]) -> Any:
-        """What a function returns on rank 0, plain data, on all ranks, however long it takes."""
+        """What a function returns on rank 0, on all ranks, however long it takes."""
         return call()
+
+    def collect(self, own: list[Any]) -> list[Any]:
+        """Results of all parts of a work, on rank 0, from each rank's own; none on the others. The ranks wait
+        for each other, however long it takes.
+
+        Args:
+            own: in order, of the parts that :attr:`own_parts` chooses from their list.
+        """
+        return own
 
     @contextmanager
     def preparing(self) -> Iterator[None]:

@@ -7,7 +7,6 @@ import math
 import shutil
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
-from functools import partial
 from pathlib import Path
 
 from tensordict import TensorDictBase
@@ -26,7 +25,8 @@ __all__ = ["SCORE", "Validate", "run_training"]
 SCORE = "eval/validation/spl"
 
 #: Evaluation during a training, called at every line of the log with whether it is the last: metrics, the
-#: same names each time, NaN where none was due. :class:`vusfa.experiments.validation.Validation` is one.
+#: same names each time, NaN where none was due. All ranks call it and get the same.
+#: :class:`vusfa.experiments.validation.Validation` is one.
 Validate = Callable[[bool], Mapping[str, float]]
 
 
@@ -51,7 +51,8 @@ def run_training(
         loggers: receive metrics and checkpoints.
         stop: checked after each update.
         progress: the live line.
-        converged: called every ``early_stopping.every`` frames; whether the training may end.
+        converged: called every ``early_stopping.every`` frames; whether the training may end, the same on all
+            ranks.
         validate: its metrics join those of the log.
 
     Raises:
@@ -91,13 +92,13 @@ def _run(
         ended = trainer.frames >= total  # a short training is logged, too
         if converged is not None and not ended and before // every < trainer.frames // every:
             with trainer.whole():
-                ended = ranks.first(converged)
+                ended = converged()
         is_best = False
         if ended or before // log_every < trainer.frames // log_every:
             validated: Mapping[str, float] = {}
             if validate is not None:
                 with trainer.whole():
-                    validated = ranks.first(partial(validate, ended))
+                    validated = validate(ended)
             metrics = trainer.metrics() | dict(validated)
             loggers.log_metrics(metrics, trainer.frames)
             progress.rates(metrics, validated=validate is not None)
