@@ -6,12 +6,13 @@ import csv
 import hashlib
 import json
 import math
+import os
 from pathlib import Path
 
 import pytest
 
-from vusfa.errors import ConfigError, SceneError
-from vusfa.files import file_sha256, plain_cell, replacing, write_csv, write_json
+from vusfa.errors import ConfigError, SceneError, check_choices
+from vusfa.files import check_file, check_folder, file_sha256, plain_cell, replacing, write_csv, write_json
 
 
 def test_a_failure_leaves_the_old_file_and_nothing_else(tmp_path: Path):
@@ -81,3 +82,37 @@ def test_the_hash_of_a_file(tmp_path: Path) -> None:
     assert file_sha256(tmp_path / "f") == hashlib.sha256(content).hexdigest()
     with pytest.raises(SceneError, match="cannot be read"):
         file_sha256(tmp_path / "g")
+
+
+def test_a_file_that_cannot_be_written_is_found_before_the_work(tmp_path: Path) -> None:
+    pipe, long = tmp_path / "pipe", tmp_path / ("x" * 250)
+    os.mkfifo(pipe)
+    assert check_file(tmp_path / "new" / "a.gif") == tmp_path / "new" / "a.gif"
+    for path, words in {
+        "/proc/x.gif": r"the file to write is '/proc/x\.gif', but /proc may not be written \(",
+        tmp_path: "is a folder; name the file to write",
+        Path("."): "is a folder",
+        pipe: "pipe: is no regular file",
+        "/dev/null": "/dev/null: is no regular file",
+        "/dev/stdout": "/dev/stdout: is no regular file",
+        pipe / "a.gif": "pipe is not a folder; give another",
+        long: "File name too long; name another",
+    }.items():
+        with pytest.raises(ConfigError, match=words):
+            check_file(path)
+    assert list(tmp_path.iterdir()) == [pipe]
+    with pytest.raises(ConfigError, match=r"results is '/proc/x/y', but /proc may not be written \(No such"):
+        check_folder("/proc/x/y", "results")
+
+
+def test_long_values_of_a_command_line_are_cut() -> None:
+    assert str(ConfigError(f"folder is '{'x' * 100_000}'; give another")).count("x") < 1000
+    assert str(ConfigError("a path of " + "x" * 900)).count("x") == 900
+
+
+def test_words_that_are_no_choice_name_the_choices() -> None:
+    check_choices("models", ["gvf"], ["gvf", "vusfa"])
+    with pytest.raises(ConfigError, match="seeds has '7'; there are 0, 1"):
+        check_choices("seeds", [0, 7], [0, 1])
+    with pytest.raises(ConfigError, match="models has 'vufsa'; did you mean 'vusfa'"):
+        check_choices("models", ["vufsa"], ["gvf", "vusfa"])

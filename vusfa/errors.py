@@ -22,12 +22,14 @@ __all__ = [
     "SceneError",
     "VusfaError",
     "WorkerError",
+    "check_choices",
     "near",
     "printable",
 ]
 
 # Control characters but tab and newline, marks that turn the direction of text, halves of characters.
 _UNPRINTABLE = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u200e\u200f\u202a-\u202e\u2066-\u2069\ud800-\udfff]")
+_LONG = re.compile(r"\S{1001,}")
 
 
 def printable(text: str) -> str:
@@ -38,6 +40,15 @@ def printable(text: str) -> str:
     'hall\\x1b[2J'
     """
     return _UNPRINTABLE.sub(lambda match: match[0].encode("unicode_escape").decode(), text)
+
+
+def bounded(text: str) -> str:
+    """Text whose words of more than 1,000 characters, a value of a command line, are cut.
+
+    >>> len(bounded(f"folder is '{'x' * 100_000}'; give another"))
+    541
+    """
+    return _LONG.sub(lambda match: f"{match[0][:400]}...{match[0][-100:]}", text)
 
 
 def near(word: object, choices: Iterable[object], otherwise: str | None = None) -> str:
@@ -56,6 +67,20 @@ def near(word: object, choices: Iterable[object], otherwise: str | None = None) 
     return f"did you mean {found[0]!r}?" if found else otherwise or f"there are {', '.join(names)}"
 
 
+def check_choices(name: str, given: Iterable[object], choices: Iterable[object]) -> None:
+    """Refuse words that are none of the choices.
+
+    >>> check_choices("models", ["gvf", "vufsa"], ["gvf", "vusfa"])
+    Traceback (most recent call last):
+    ...
+    vusfa.errors.ConfigError: models has 'vufsa'; did you mean 'vusfa'?
+    """
+    names = [str(choice) for choice in choices]
+    for word in given:
+        if str(word) not in names:
+            raise ConfigError(f"{name} has {str(word)[:200]!r}; {near(word, names)}")
+
+
 class VusfaError(ValueError):
     """Base of every error that bad input causes.
 
@@ -66,8 +91,9 @@ class VusfaError(ValueError):
     """
 
     def __str__(self) -> str:
-        """The message, :func:`printable`, for it often holds what a file says."""
-        return printable(super().__str__())
+        """The message, :func:`printable` and its words :func:`bounded`, for it often holds what a file or a
+        command line says."""
+        return bounded(printable(super().__str__()))
 
 
 class SceneError(VusfaError):

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import csv
 import hashlib
-import io
 import json
 import math
 import os
@@ -24,6 +23,7 @@ from vusfa.errors import ConfigError, ResultError, SceneError, printable
 
 __all__ = [
     "cannot_write",
+    "check_file",
     "check_folder",
     "file_sha256",
     "plain_cell",
@@ -53,13 +53,51 @@ def check_folder(path: str | Path, setting: str) -> Path:
     """
     if not isinstance(path, str | os.PathLike):
         raise ConfigError(f"{setting} is {path!r}; give the path of a folder")
-    absolute = Path(path).absolute()
+    _check_place(Path(path).absolute(), f"{setting} is {str(path)!r}")
+    return Path(path)
+
+
+def _check_place(absolute: Path, what: str) -> None:
     nearest = next(place for place in (absolute, *absolute.parents) if os.path.lexists(place))
     if not os.path.isdir(nearest):
-        raise ConfigError(f"{setting} is {str(path)!r}, but {nearest} is not a folder; give another")
-    if not os.access(nearest, os.W_OK | os.X_OK):
-        raise ConfigError(f"{setting} is {str(path)!r}, but {nearest} may not be written; give another")
-    return Path(path)
+        raise ConfigError(f"{what}, but {nearest} is not a folder; give another")
+    try:
+        with tempfile.TemporaryFile(dir=nearest):  # /proc and a full disk let everybody in, too
+            pass
+    except OSError as error:
+        reason = f"may not be written ({error.strerror})"
+        raise ConfigError(f"{what}, but {nearest} {reason}; give another") from error
+
+
+def check_file(path: str | Path, setting: str = "the file to write") -> Path:
+    """Refuse, before the work, a file that :func:`replacing` could not write after it. Nothing is made.
+
+    Raises:
+        ConfigError: it is a folder, a device or a pipe, or its folder may not be written.
+
+    >>> check_file("/dev/null")
+    Traceback (most recent call last):
+    ...
+    vusfa.errors.ConfigError: /dev/null: is no regular file; name the file to write
+    """
+    path = Path(path)
+    if os.path.isdir(path):
+        raise ConfigError(f"{path}: is a folder; name the file to write")
+    points_to_process = os.path.islink(path) and os.readlink(path).startswith("/proc/")  # /dev/stdout
+    if points_to_process or (os.path.exists(path) and not os.path.isfile(path)):
+        raise ConfigError(f"{path}: is no regular file; name the file to write")
+    _check_place(path.absolute().parent, f"{setting} is {str(path)!r}")
+    try:
+        os.lstat(_unfinished(path))
+    except FileNotFoundError:
+        return path
+    except OSError as error:
+        raise ConfigError(f"{path}: {error.strerror}; name another file to write") from error
+    return path
+
+
+def _unfinished(path: Path) -> Path:
+    return path.with_name(f".{path.name}.{os.getpid()}.tmp")
 
 
 def file_sha256(path: str | os.PathLike[str]) -> str:
@@ -94,7 +132,7 @@ def replacing(path: str | Path) -> Iterator[Path]:
     'whole'
     """
     path = Path(path)
-    unfinished = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    unfinished = _unfinished(path)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         yield unfinished
@@ -181,14 +219,15 @@ def write_csv(
     NaN becomes an empty field. Text that a spreadsheet would take for a formula gets an apostrophe before it,
     which :func:`plain_cell` takes off again.
     """
-    rows = list(rows)
-    names = list(columns if columns is not None else rows[0] if rows else [])
-    text = io.StringIO(newline="")
-    writer = csv.DictWriter(text, names, lineterminator="\n")
-    writer.writerow({name: _cell(name) for name in names})
-    for row in rows:
-        writer.writerow({key: _cell(value) for key, value in row.items()})
-    return write_text(path, text.getvalue())
+    if columns is None:
+        rows = list(rows)
+        columns = list(rows[0] if rows else [])
+    with replacing(path) as unfinished, open(unfinished, "w", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, list(columns), lineterminator="\n")
+        writer.writerow({name: _cell(name) for name in columns})
+        for row in rows:
+            writer.writerow({key: _cell(value) for key, value in row.items()})
+    return Path(path)
 
 
 def plain_cell(text: str) -> str:

@@ -65,6 +65,8 @@ MAX_YAML_DEPTH, MAX_YAML_NODES, MAX_YAML_SCALAR = 20, 100_000, 10_000
 MAX_JSON_BYTES = 1 << 24
 #: Size of a CSV file, read at some 3 MB per second; different words in it.
 MAX_CSV_BYTES, MAX_CSV_WORDS = 1 << 25, 100_000
+#: Size of a training's own log when it is resumed, which is read row by row.
+MAX_LOG_BYTES = 1 << 28
 #: Size of a CSV file of poses or moves, which become Python's objects.
 MAX_TABLE_BYTES = 1 << 24
 #: Size of one file of a library of furniture.
@@ -110,6 +112,25 @@ MAX_BATCH_FRAMES, MAX_EPISODES = 1 << 28, 1 << 26
 
 #: Size of one picture of a stream.
 MAX_STREAM_PICTURE_BYTES = 1 << 25
+
+# ---- command line
+
+#: Least and largest values of options, by their name in all commands.
+RANGES: dict[str, tuple[float, float]] = {
+    "seed": (0, (1 << 63) - 1),
+    "seeds": (0, (1 << 32) - 1),
+    "max_steps": (1, MAX_EPISODE_STEPS),
+    "walk_steps": (0, MAX_EPISODE_STEPS),
+    "episodes": (1, 1_000_000),
+    **dict.fromkeys(("attempts", "pictures", "sets", "tested", "trained"), (1, 10_000)),
+    "walks": (0, 10_000),
+    **dict.fromkeys(("goals_per_scene", "cells"), (0, MAX_STATES)),
+    **dict.fromkeys(("width", "height", "size", "resize", "samples"), (1, MAX_PICTURE_SIDE)),
+    "batch": (1, 1 << 16),
+    "resamples": (1, 100_000),
+    "megabytes": (0, 4096),
+    "threads": (1, 1024),
+}
 
 # ---- messages
 

@@ -9,6 +9,7 @@ import re
 import sys
 import threading
 from collections.abc import Iterator
+from contextlib import suppress
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from importlib import import_module, reload
 from pathlib import Path
@@ -32,6 +33,7 @@ class Hub(ThreadingHTTPServer):
         super().__init__(("127.0.0.1", 0), Handler)
         self.files: dict[tuple[str, str], bytes] = {}
         self.asked: list[str] = []
+        self.ended = threading.Event()
 
 
 class Handler(BaseHTTPRequestHandler):
@@ -107,6 +109,7 @@ def hub(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[Hub]:
     monkeypatch.setenv("NO_PROXY", "127.0.0.1")
     threading.Thread(target=server.serve_forever, args=(0.01,), daemon=True).start()
     yield server
+    server.ended.set()
     server.shutdown()
     server.server_close()
 
@@ -176,6 +179,27 @@ def test_whatever_a_hub_answers_is_one_line(hub: Hub, monkeypatch: pytest.Monkey
         HubAgent.from_pretrained("someone/liar")
     assert len(str(caught.value).splitlines()) == 1
     assert len(str(caught.value)) < 500
+
+
+@pytest.mark.parametrize("drips", [True, False])
+def test_a_hub_that_drips_or_says_nothing_is_given_up(
+    hub: Hub, monkeypatch: pytest.MonkeyPatch, drips: bool
+) -> None:
+    def answer(handler: Handler) -> None:
+        if handler.command == "HEAD":
+            return handler.answer(b"x" * 1000, ETag='"a"', X_Repo_Commit=COMMIT)
+        handler.send_response(200)
+        handler.send_header("Content-Length", "1000")
+        handler.end_headers()
+        with suppress(OSError):
+            while not hub.ended.wait(0.02):
+                handler.wfile.write(b"x" if drips else b"")
+
+    monkeypatch.setattr(Handler, "do_GET", answer)
+    monkeypatch.setattr(Handler, "do_HEAD", answer)
+    words = r"^someone/slow: agent\.safetensors has not arrived within 0\.5 s; check the connection"
+    with pytest.raises(CheckpointError, match=words):
+        HubAgent.from_pretrained("someone/slow", patience=0.5)
 
 
 @pytest.mark.parametrize("name", ["a/b/c", "../x", "", "-x", "x" * 5000])

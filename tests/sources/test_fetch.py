@@ -107,7 +107,7 @@ class Server:
             request.end_headers()
         block = b"x" * (1 if "drip" in mood else 1 << 16)
         with suppress(OSError):
-            request.wfile.write(b"X-Long: " if mood == "dripping head" else b"")
+            request.wfile.write(b"X-Long: " if mood == "dripping head" else self.content[:4])
             while not self.release.wait(0.02 if "drip" in mood else 0):
                 request.wfile.write(block)
                 self.sent += len(block)
@@ -267,15 +267,27 @@ def test_a_server_that_drips_is_given_up(serve: Callable, tmp_path: Path, mood: 
         download(server.url, tmp_path / "f", Patience(connect=0.2, silence=0.1, attempts=1, pause=0.01))
 
 
-def test_a_file_without_end_is_given_up(
-    serve: Callable, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("vusfa.sources.download.MAX_ARCHIVE_BYTES", 1 << 20)
+def test_a_file_without_end_is_given_up(serve: Callable, tmp_path: Path) -> None:
     server = serve(CONTENT)
     server.mood = ["endless"]
     with pytest.raises(SceneError, match=r"the file has more than 1048576 bytes; give another mirror"):
-        download(server.url, tmp_path / "f", QUICK)
+        download(server.url, tmp_path / "f", QUICK, most=1 << 20)
     assert hidden(tmp_path) == []
+
+
+def test_a_zip_without_end_is_given_up_at_the_size_of_its_scenes(
+    serve: Callable, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("vusfa.sources.fetch.MAX_STATE_BYTES", 1 << 16)
+    server = serve(b"PK\3\4" + CONTENT)
+    server.mood = ["endless"]
+    with pytest.raises(SceneError, match=r"the file has more than 655360 bytes; give another mirror"):
+        fetch(described(server.url), tmp_path / "scenes")
+    assert names(tmp_path / "scenes") == []
+    with pytest.raises(
+        SceneError, match=r"the file has 1024004 bytes, more than 655360; give another mirror"
+    ):
+        fetch(described(server.url), tmp_path / "scenes")
 
 
 def test_the_endless_body_of_a_redirection_is_not_read(serve: Callable, tmp_path: Path) -> None:

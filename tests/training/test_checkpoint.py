@@ -5,6 +5,7 @@ from __future__ import annotations
 import random
 import shutil
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,7 @@ import torch
 from tensordict import TensorDict
 
 from vusfa.cli.launch import launch
-from vusfa.errors import CheckpointError
+from vusfa.errors import CheckpointError, ConfigError
 from vusfa.experiments.training import train
 from vusfa.scenes import Scene, SceneSet
 from vusfa.training import load_agent
@@ -139,3 +140,11 @@ def test_a_training_of_version_0_1_goes_on(tmp_path: Path, monkeypatch: pytest.M
 def test_settings_that_only_version_0_1_has_are_named():
     with pytest.raises(CheckpointError, match=r"objective.n_steps=5, which only version 0.1 has"):
         upgrade_config({"objective": {"n_steps": 5}})
+
+
+@pytest.mark.parametrize("device", ["cuda:99", "meta", "nope", "cpu:\x1b[2J"])
+def test_a_device_that_is_not_there_is_found_before_the_file_is_read(tmp_path: Path, device: str):
+    for read in (load_checkpoint, partial(load_agent, scenes=None)):
+        with pytest.raises(ConfigError, match=r"device is '.*', which cannot be used here") as error:
+            read(tmp_path / "none.pt", device=device)
+        assert "\x1b" not in str(error.value)

@@ -6,6 +6,7 @@ import csv
 import io
 import json
 import math
+import os
 import time
 from pathlib import Path
 from typing import Any
@@ -14,7 +15,7 @@ import pytest
 from PIL import Image
 
 from vusfa import __version__
-from vusfa.errors import ConfigError, ResultError
+from vusfa.errors import ConfigError, ResultError, VusfaError
 from vusfa.report.film import encode_gif
 from vusfa.training import make_loggers
 from vusfa.training.loggers import CSVLogger, Loggers
@@ -314,3 +315,36 @@ def test_an_exception_closes_loggers_with_a_failure():
     with pytest.raises(RuntimeError, match="lost"), Loggers([Recorder()]):
         raise RuntimeError("lost")
     assert codes == [143, 1]
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        (b"frames,loss\n24,0.5\n\xff\xfe\x00junk\n", "cannot be read, row 1 ('utf-8' codec can't decode"),
+        (b"frames,loss\n24,0.5\nx,0.5\n", "cannot be read, row 3 (invalid literal for int()"),
+        (b"frames,loss\n" + b"9" * 5000 + b",0.5\n", "cannot be read, row 2 (Exceeds the limit"),
+        (b"loss\n0.5\n", "it has no column 'frames'"),
+        (b"frames\n" + b"1" * 200_000, "cannot be read, row 1 (field larger than field limit"),
+        ("pipe", "is no regular file"),
+        ("folder", "is a folder"),
+        ("huge", f"it has more than {1 << 28} bytes"),
+    ],
+)
+def test_a_log_that_is_none_ends_a_resumed_run_before_its_first_update(
+    tmp_path: Path, content: Any, words: str
+) -> None:
+    path = tmp_path / "metrics.csv"
+    if content == "pipe":
+        os.mkfifo(path)
+    elif content == "folder":
+        path.mkdir()
+    elif content == "huge":
+        path.touch()
+        os.truncate(path, 2 << 30)
+    else:
+        path.write_bytes(content)
+    with pytest.raises(VusfaError) as error:
+        make_loggers(["csv"], tmp_path, {}, run_id="a", resume_frames=24)
+    assert str(error.value).startswith(f"{path}: ")
+    assert words in str(error.value)
+    assert [place.name for place in tmp_path.iterdir()] == ["metrics.csv"]

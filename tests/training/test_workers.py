@@ -20,7 +20,7 @@ from omegaconf import OmegaConf
 from vusfa.cli.launch import compose
 from vusfa.errors import ResultError, WorkerError
 from vusfa.training import StopOnSignal, Trainer, load_checkpoint, make_trainer, run_training
-from vusfa.training.workers import _WatchedQueue, started
+from vusfa.training.workers import Silence, _WatchedQueue, started
 
 SMALL = ["agent.hidden_size=8", "agent.embedding_size=8", "agent.history=1", "env.goals=[3,9,12]"]
 SMALL += ["collector.num_envs=6", "collector.rollout=4", "scenes=[bathroom]", "total_frames=1000000"]
@@ -87,7 +87,8 @@ def test_a_worker_that_is_stopped(tmp_path: Path, kind: str):
     """In multi_async and hogwild the others go on sending."""
     stop = partial(signal_worker, signal.SIGSTOP)
     text = ended_by(stop, tmp_path / "a.pt", f"collector={kind}", "collector.timeout=1.5", "optim=a3c")
-    assert re.match(r"worker (0 .*, )?1 \(process \d+\) of the collector has sent nothing for 1.5 s", text)
+    named = r"worker 1 \(process \d+\) of the collector is stopped by a signal and has sent nothing for 1.5 s"
+    assert re.match(named, text), text
     assert load_checkpoint(tmp_path / "a.pt")["frames"] >= 36
 
 
@@ -151,3 +152,34 @@ def test_time_in_which_the_training_itself_was_stopped_does_not_count(monkeypatc
         watched.get()
     else:
         pytest.fail("the silence of worker 0 was not seen")
+
+
+class Process:
+    pid = 1  # which no signal stops
+
+
+def test_of_workers_that_wait_for_each_other_the_silent_one_is_named(monkeypatch: pytest.MonkeyPatch):
+    now = [0.0]
+    monkeypatch.setattr("vusfa.training.workers.time.monotonic", lambda: now[0])
+    silence = Silence([Process(), Process(), Process()], 5.0, in_rounds=True)
+    for index in (0, 1, 2, 0, 2):  # a round, and of the next all but 1
+        silence.ends(index)
+        silence.check()
+    now[0] = 6.0
+    with pytest.raises(
+        WorkerError, match=r"^worker 1 \(process 1\) of the collector has sent nothing for 5 s"
+    ):
+        silence.check()
+
+
+def test_where_the_silent_one_cannot_be_known_it_is_said(monkeypatch: pytest.MonkeyPatch):
+    now = [0.0]
+    monkeypatch.setattr("vusfa.training.workers.time.monotonic", lambda: now[0])
+    silence = Silence([Process(), Process(), Process()], 5.0)
+    now[0] = 4.0
+    silence.ends(1)
+    silence.check()
+    now[0] = 6.0
+    words = r"^worker 0 .*, 2 .* \(collector.timeout\); which of them the others wait for cannot be known$"
+    with pytest.raises(WorkerError, match=words):
+        silence.check()

@@ -7,11 +7,10 @@ from importlib import import_module
 from typing import Annotated, Any
 
 import typer
-from typer.core import TyperGroup
 
 from vusfa import __version__
 from vusfa.cli import COMMANDS, FIRST_STEPS, FUNCTIONS, TRAINING_COMMANDS
-from vusfa.cli.functions import App, forward
+from vusfa.cli.functions import App, Commands, forward
 from vusfa.errors import VusfaError
 from vusfa.limits import brief
 
@@ -21,7 +20,7 @@ __all__ = ["app", "scenes"]
 _WRONG_NAMES = (errno.ENAMETOOLONG, errno.ELOOP, errno.ENOTDIR)
 
 
-class _Commands(TyperGroup):
+class _Commands(Commands):
     """Report an early end of any command as one line and an exit code."""
 
     def invoke(self, ctx: Any) -> Any:

@@ -41,9 +41,11 @@ def film(
         vusfa film runs/first --goal 12 --start 140 --out walk.gif
     """
     from vusfa.deploy.agents import open_agent
+    from vusfa.files import check_file
     from vusfa.report.film import draw_film, farthest_pair, record_walk, write_gif
     from vusfa.training import make_observation
 
+    check_file(out)
     loaded = open_agent(agent)
     first, last = farthest_pair(loaded.scenes, 0 if scene is None else scene, start, goal, loaded.goals)
     trail = record_walk(

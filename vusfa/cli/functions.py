@@ -8,25 +8,99 @@ from __future__ import annotations
 
 import functools
 import inspect
+import math
 import re
 import signal
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from importlib import import_module
 from operator import getitem
 from typing import Annotated, Any, get_type_hints
 
 import typer
-from typer.core import TyperCommand, TyperOption
+from typer.core import TyperCommand, TyperGroup, TyperOption
 
 from vusfa.cli import Forwarded
-from vusfa.errors import VusfaError
+from vusfa.errors import ConfigError, VusfaError, printable
+from vusfa.limits import RANGES, brief, one_line
 
-__all__ = ["App", "as_command", "forward", "make_app", "run_functions"]
+__all__ = ["App", "Commands", "as_command", "forward", "make_app", "run_functions"]
+
+_UsageError: Any = typer.BadParameter.__mro__[1]  # typer does not export it
+
+
+@contextmanager
+def _one_line_of_usage() -> Iterator[None]:
+    """Context that reports a wrong command line as one line and exit code 2, without a box around it."""
+    try:
+        yield
+    except _UsageError as error:
+        if type(error).__name__ == "NoArgsIsHelpError":  # whose text is the help
+            raise
+        typer.echo(f"error: {_usage(error)}", err=True)
+        raise typer.Exit(2) from error
+
+
+def _usage(error: Any) -> str:
+    """What is wrong with a command line: the option, its value, and where the help is."""
+    param, text = getattr(error, "param", None), one_line(error.format_message()).rstrip(".")
+    found: list[Any] = getattr(error.__cause__, "errors", list)()  # of pydantic, which has the value
+    if param is not None and found:
+        said = one_line(found[0]["msg"]).removeprefix("Value error, ").rstrip(".")
+        said = said.replace("Input should", "it should", 1)
+        text = f"{param.name} is {brief(found[0]['input'])}; {said}"
+    context = getattr(error, "ctx", None)
+    mend = f"; {context.command_path} --help lists what there is" if context is not None else ""
+    return printable(f"{text[:1].lower()}{text[1:]}{mend}")
+
+
+def check_numbers(values: Mapping[str, Any]) -> None:
+    """Refuse numbers of a command line that are not in their range of :data:`vusfa.limits.RANGES`, that no
+    processor counts to, or that are not finite.
+
+    >>> check_numbers({"max_steps": 10**9})
+    Traceback (most recent call last):
+    ...
+    vusfa.errors.ConfigError: max_steps is 1000000000; give 1 to 100,000
+    """
+    for name, value in values.items():
+        for number in value if isinstance(value, list | tuple) else [value]:
+            if type(number) not in (int, float):
+                continue
+            least, most = RANGES.get(name, (-(2**63), 2**63 - 1))
+            if not least <= number <= most or not math.isfinite(number):
+                what = f"{least:,} to {most:,}" if name in RANGES else "a number that a computer can count to"
+                raise ConfigError(f"{name} is {brief(number)}; give {what}")
+
+
+class Commands(TyperGroup):
+    """A group of commands; a wrong command line is one line of error."""
+
+    def make_context(self, *given: Any, **extra: Any) -> Any:
+        """Read the group's own options."""
+        with _one_line_of_usage():
+            return super().make_context(*given, **extra)
+
+    def invoke(self, ctx: Any) -> Any:
+        """Run the command that the context names."""
+        with _one_line_of_usage():
+            return super().invoke(ctx)
 
 
 class Command(TyperCommand):
     """A command whose options may be written ``name=value``, and take lists: ``[0,1]``, ``--seeds 0 1``."""
+
+    def make_context(self, *given: Any, **extra: Any) -> Any:
+        """Read arguments and options, and check their numbers before any work."""
+        with _one_line_of_usage():
+            context = super().make_context(*given, **extra)
+        try:
+            check_numbers(context.params)
+        except ConfigError as error:
+            typer.echo(f"error: {error}", err=True)
+            raise typer.Exit(1) from error
+        return context
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Write every option as click reads it: ``--name=value``, once per value."""
@@ -76,6 +150,7 @@ class App(typer.Typer):
 
     def __init__(self, **settings: Any) -> None:
         looks: dict[str, Any] = {
+            "cls": Commands,
             "no_args_is_help": True,
             "rich_markup_mode": "markdown",
             "pretty_exceptions_enable": False,

@@ -109,14 +109,16 @@ def show(
         vusfa scenes show kitchen
         vusfa scenes show my_room.h5 -o my_room.png --pictures 20
     """
+    from vusfa.files import check_file
     from vusfa.scenes import SceneSet
     from vusfa.sources.sheet import save_sheet
     from vusfa.sources.summary import summarize
 
+    target = check_file(output or Path(Path(scene).stem + ".png"))
     (loaded,) = SceneSet.open(scene).scenes
     for line in _description(loaded, summarize(loaded)):
         typer.echo(printable(line))
-    typer.echo(f"drawn: {save_sheet(loaded, output or Path(Path(scene).stem + '.png'), pictures)}")
+    typer.echo(f"drawn: {save_sheet(loaded, target, pictures)}")
 
 
 def _description(scene: Scene, summary: Summary) -> list[str]:

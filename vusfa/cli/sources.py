@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
@@ -22,13 +23,11 @@ def check_target(target: Path, force: bool) -> None:
     Raises:
         ConfigError: it exists and ``force`` is not given, or its folder cannot be written.
     """
-    from vusfa.files import check_folder
+    from vusfa.files import check_file
 
-    if target.is_dir():
-        raise ConfigError(f"{target}: is a folder; name the file to write")
-    if target.exists() and not force:
+    if os.path.isfile(target) and not force:
         raise ConfigError(f"{target}: exists; choose another name, or replace it with --force")
-    check_folder(target.absolute().parent, "the folder of the file to write")
+    check_file(target)
 
 
 def say_next(target: Path) -> None:

@@ -7,6 +7,8 @@ repository holds ``agent.safetensors`` (:mod:`vusfa.deploy.agents`) and the mode
 from __future__ import annotations
 
 import os
+import queue
+import threading
 from pathlib import Path
 from typing import Any
 
@@ -64,7 +66,7 @@ class HubAgent(ModelHubMixin, library_name="vusfa"):
 
     @classmethod
     def from_pretrained(  # type: ignore[override]
-        cls, source: str | Path, *, scenes: SceneSet | None = None, **options: Any
+        cls, source: str | Path, *, scenes: SceneSet | None = None, patience: float = 600.0, **options: Any
     ) -> HubAgent:
         """Load an agent from a hub or from a folder of ``save_pretrained``.
 
@@ -73,6 +75,7 @@ class HubAgent(ModelHubMixin, library_name="vusfa"):
         Args:
             source: ``OWNER/NAME`` on the hub, or a folder.
             scenes: the rooms that the agent was trained in, when they are not bundled.
+            patience: seconds that each of the two files may take; a server may also send a byte now and then.
             options: of ``huggingface_hub.hf_hub_download``: ``revision``, ``cache_dir``, ``force_download``,
                 ``token``, ``local_files_only``.
 
@@ -81,7 +84,7 @@ class HubAgent(ModelHubMixin, library_name="vusfa"):
             SceneError: its rooms are not here.
         """
         path, card = (
-            Path(source, name) if os.path.isdir(source) else _fetched(str(source), name, options)
+            Path(source, name) if os.path.isdir(source) else _fetched(str(source), name, patience, options)
             for name in (_FILE, _CARD)
         )
         if path is None:
@@ -98,10 +101,28 @@ class HubAgent(ModelHubMixin, library_name="vusfa"):
         return cls(found._replace(card=text))
 
 
-def _fetched(source: str, name: str, options: dict[str, Any]) -> Path | None:
+def _fetched(source: str, name: str, patience: float, options: dict[str, Any]) -> Path | None:
     """A file of a repository in the cache; None when the repository is there without it."""
+    found: queue.Queue[Any] = queue.Queue()
+
+    def fetch() -> None:
+        try:
+            found.put(hf_hub_download(source, name, **options))
+        except BaseException as error:
+            found.put(error)
+
+    # the library's own limits are of each read: in a thread, a server that drips keeps nobody else waiting
+    threading.Thread(target=fetch, daemon=True).start()
     try:
-        return Path(hf_hub_download(source, name, **options))
+        result = found.get(timeout=patience)
+        if isinstance(result, BaseException):
+            raise result
+        return Path(result)
+    except queue.Empty as error:
+        raise CheckpointError(
+            f"{source[:200]}: {name} has not arrived within {patience:g} s; check the connection, or give"
+            " more patience="
+        ) from error
     except Exception as error:  # whatever a server says and the library makes of it
         if isinstance(error, EntryNotFoundError) and not isinstance(error, LocalEntryNotFoundError):
             return None

@@ -15,6 +15,7 @@ from vusfa.evaluation.exact import exact_goals, uniform_probabilities
 from vusfa.evaluation.long_table import MEAN_OF_STATES
 from vusfa.experiments.measure import evaluation_policy, evaluation_precision
 from vusfa.experiments.runs import Run, check_run_name, write_run
+from vusfa.files import check_folder
 from vusfa.limits import brief
 from vusfa.modules import Agent
 from vusfa.scenes import SceneSet
@@ -103,6 +104,7 @@ def robustness(
     set_threads(threads)
     if episodes < 1:
         raise ConfigError(f"episodes is {episodes}; give 1 or more")
+    check_folder(results / "robustness", "results")
     names = _change_names(changes)
     agent, own, state = load_agent(checkpoint_file(checkpoint))
     check_run_name(f"{name}-{state['config']['seed']}")  # before the work

@@ -14,9 +14,9 @@ from vusfa.cluster.cells import Cell, run_cells
 from vusfa.errors import SceneError
 from vusfa.evaluation import Episodes, evaluate, print_summary, random_walk_summary, summary
 from vusfa.evaluation.exact import exact_goals, uniform_probabilities
-from vusfa.experiments.runs import Run, read_run, write_run
+from vusfa.experiments.runs import Run, check_run_name, read_run, write_run
 from vusfa.experiments.training import compose_settings, train
-from vusfa.files import say
+from vusfa.files import check_folder, say
 from vusfa.modules import InferencePolicy, TriedActions, transplant
 from vusfa.scenes import SceneSet
 from vusfa.training import EvaluationProgress, load_agent, run_facts
@@ -97,6 +97,8 @@ def generalise(
     """
     how: dict[str, Any] = {"weight": weight, "temperature": temperature, "episodes": episodes}
     how |= {"results": results, "runs": runs}
+    check_run_name(f"{name}-{seed}")
+    check_folder(runs / "generalise", "runs")
     first, last = split_rooms(rooms, trained, tested)
     compose_settings(["preset=unseen", *overrides])  # mistakes show before any work
     cells = {

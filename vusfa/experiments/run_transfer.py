@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import time
 from functools import partial
 from pathlib import Path
@@ -11,9 +12,10 @@ from rich.console import Console
 from rich.progress import track
 
 from vusfa.cluster.cells import Cell, run_cells
-from vusfa.errors import CheckpointError
+from vusfa.envs.scene_env import check_counts
+from vusfa.errors import CheckpointError, check_choices
 from vusfa.experiments.fine_tune import fine_tune, fine_tuning_settings
-from vusfa.experiments.runs import Run, read_run, write_run
+from vusfa.experiments.runs import Run, check_run_name, read_run, write_run
 from vusfa.experiments.transfer import FINE_TUNED, FROM_SCRATCH, KINDS, new_goals
 from vusfa.modules.config import MODELS
 from vusfa.training import load_agent, run_facts, set_threads
@@ -54,6 +56,10 @@ def run_transfer(
         experiment: where results go.
         launcher, launcher_options: what runs the cells: serial, local, slurm or ray (docs/cluster.md).
     """
+    check_choices("models", models, MODELS)
+    check_choices("kinds", kinds, KINDS)
+    check_counts(sets=(sets, 1), frames=(frames, 1), every=(every, 1))
+    check_run_name(experiment)
     numbers: dict[str, Any] = {"sets": sets, "frames": frames, "every": every}
     places: dict[str, Any] = {"source": source, "results": results, "runs": runs, "experiment": experiment}
     cells = [
@@ -65,6 +71,8 @@ def run_transfer(
         for kind in kinds
         for model in models
     ]
+    for model, seed in itertools.product(models, seeds):  # what is missing shows before any work
+        read_run(results, source, f"{model}-{seed}")
     run_cells(cells, launcher, launcher_options)
 
 

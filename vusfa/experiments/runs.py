@@ -11,6 +11,7 @@ The folder appears at once and complete, or not at all.
 
 from __future__ import annotations
 
+import os
 import shutil
 import tempfile
 from collections.abc import Mapping, Sequence
@@ -29,10 +30,10 @@ from vusfa.evaluation.episodes import Episodes
 from vusfa.evaluation.exact import ExactGoals
 from vusfa.evaluation.long_table import episode_rows, exact_rows, join_tables, row_label
 from vusfa.files import write_json
-from vusfa.limits import MAX_EPISODE_STEPS, brief
+from vusfa.limits import MAX_EPISODE_STEPS, brief, listing
 from vusfa.reading import check_fields, read_json, read_npz
 
-__all__ = ["Run", "check_run_name", "read_run", "read_runs", "write_run"]
+__all__ = ["Run", "check_run_name", "no_results", "read_run", "read_runs", "write_run"]
 
 _EXACT = "exact"
 _AGAIN = "delete the folder and run it again"
@@ -161,6 +162,8 @@ def read_run(root: str | Path, experiment: str, name: str) -> Run:
     """
     folder = Path(root) / experiment / name
     path = folder / "cell.json"
+    if not os.path.lexists(path):
+        raise no_results(folder.parent, name)
     content = read_json(path, ResultError, _AGAIN)
     content = {"episodes": [], "scenes": [], "max_steps": 0, **content}
     check_fields(content, _FIELDS, path, ResultError, _AGAIN)
@@ -181,6 +184,19 @@ def read_run(root: str | Path, experiment: str, name: str) -> Run:
         except (TypeError, ValueError) as error:
             raise ResultError(f"{file}: {error}; {_AGAIN}") from error
     return Run(experiment, name, content["info"], episodes, _read_exact(folder / f"{_EXACT}.npz"))
+
+
+def no_results(folder: str | Path, *names: str, command: str = "") -> ResultError:
+    """The error of runs or experiments that are not there; it says which there are, and what makes them.
+
+    >>> str(no_results("/no/such", "table1"))
+    '/no/such: no results of table1; there are none'
+    """
+    mend = f"; run {command} first" if command else ""
+    there = {place.relative_to(folder).parts[0] for place in Path(folder).glob("**/cell.json")}
+    return ResultError(
+        f"{folder}: no results of {' or '.join(names)}; there are {listing(sorted(there)) or 'none'}{mend}"
+    )
 
 
 def _read_exact(path: Path) -> ExactGoals | None:

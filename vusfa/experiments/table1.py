@@ -13,10 +13,12 @@ from typing import Any
 from omegaconf import open_dict
 
 from vusfa.cluster.cells import Cell, run_cells
+from vusfa.errors import ConfigError, check_choices
 from vusfa.experiments.measure import choose_checkpoint, measure_checkpoint
-from vusfa.experiments.runs import read_run, write_run
+from vusfa.experiments.runs import check_run_name, read_run, write_run
 from vusfa.experiments.training import compose_settings, train
-from vusfa.files import replacing
+from vusfa.files import check_folder, replacing
+from vusfa.limits import brief
 from vusfa.modules.config import MODELS
 
 __all__ = ["checkpoints", "table1", "table1_cell"]
@@ -77,6 +79,11 @@ def table1(
         again: evaluate existing results again, from the chosen checkpoints.
         launcher, launcher_options: what runs the cells: serial, local, slurm or ray (docs/cluster.md).
     """
+    check_choices("models", models, ["untrained", *MODELS])
+    check_run_name(experiment)
+    if not stages or not all(0 < stage <= 1 for stage in stages):
+        raise ConfigError(f"stages is {brief(stages)}; give shares of the training, above 0 and up to 1")
+    check_folder(runs / experiment, "runs")
     places: dict[str, Any] = {
         "experiment": experiment,
         "results": results,

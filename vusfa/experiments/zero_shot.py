@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from functools import partial
 from pathlib import Path
@@ -15,12 +16,13 @@ from vusfa.errors import ConfigError
 from vusfa.evaluation import compare, print_summary
 from vusfa.experiments.manifest import BUNDLED_MANIFEST, read_manifest
 from vusfa.experiments.measure import evaluation_policy, evaluation_precision
-from vusfa.files import check_folder
+from vusfa.files import check_file
 from vusfa.scenes import SceneSet
 from vusfa.training import (
     EvaluationProgress,
     checkpoint_file,
     load_agent,
+    load_checkpoint,
     make_observation,
     rebuild_agent,
     row_name,
@@ -82,7 +84,9 @@ def zero_shot(
     how |= {"seed": seed, "device": device, "threads": threads}
     places = {file: out or file.with_name("zero_shot") for file in files}
     for stem in places.values():
-        check_folder(stem.parent, "out")
+        check_file(stem.with_name(f"{stem.name}_episodes.csv"), "out")
+    for lost in (file for file in files if not os.path.exists(file)):
+        load_checkpoint(lost)  # says what is wrong, before any work
     cells = [
         Cell(stem.with_name(f"{stem.name}_episodes.csv"), partial(evaluate_checkpoint, file, stem, **how))
         for file, stem in places.items()

@@ -10,7 +10,7 @@ from typing import Literal
 
 from vusfa.envs.dynamics import MAX_STEPS
 from vusfa.errors import printable
-from vusfa.files import check_folder
+from vusfa.files import check_file, check_folder
 from vusfa.report.build import write_report
 from vusfa.report.cells import read_source
 from vusfa.report.content import Options
@@ -64,7 +64,8 @@ def report_runs(
         threads: processor threads; more than 1 pays on an idle machine only.
     """
     set_threads(threads)
-    check_folder(out.absolute().parent, "out")
+    check_file(out, "out")
+    check_folder(out.with_name(f"{out.stem}_tables"), "out")
     options = Options(
         title=title,
         goals_per_scene=goals_per_scene,

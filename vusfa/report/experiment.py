@@ -16,7 +16,7 @@ from vusfa.evaluation.baselines import RANDOM_WALK, SHORTEST_PATH, shortest_path
 from vusfa.evaluation.exact import ExactGoals, exact_goals, uniform_probabilities
 from vusfa.evaluation.long_table import distance_to_trained, episode_rows, exact_rows, join_tables
 from vusfa.evaluation.statistics import Sums
-from vusfa.experiments.runs import Run, read_runs
+from vusfa.experiments.runs import Run, no_results, read_runs
 from vusfa.limits import listing
 from vusfa.modules.config import MODELS
 from vusfa.scenes import SceneSet
@@ -93,7 +93,7 @@ def read_experiment(root: str | Path, names: Sequence[str], scenes: SceneSet | N
     """
     runs = [run for name in names for run in read_runs(root, name) if run.episodes]
     if not runs:
-        raise ResultError(f"{root}: no results of {' or '.join(names)}; run vusfa table1 first")
+        raise no_results(root, *names, command="vusfa table1")
     first = next(iter(runs[0].episodes.values()))
     for run in runs:
         for mode, table in run.episodes.items():

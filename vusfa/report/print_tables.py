@@ -7,7 +7,7 @@ from pathlib import Path
 
 from vusfa.evaluation.long_table import MEAN_OF_STATES, SUBSETS
 from vusfa.experiments.runs import read_runs
-from vusfa.files import check_folder, write_csv
+from vusfa.files import check_file, check_folder, write_csv
 from vusfa.report.experiment import Experiment, read_experiment
 from vusfa.report.generated import write_documents
 from vusfa.report.markdown import flat_rows, markdown
@@ -68,7 +68,7 @@ def print_tables(
         folder = check_folder(out or results / "tables", "out")
         world = SceneSet.open(scenes) if scenes else None
         if plot is not None:
-            check_folder(plot.absolute().parent, "plot")
+            check_file(plot, "plot")
         _print(read_experiment(results, experiments, world), folder, resamples, plot)
 
 

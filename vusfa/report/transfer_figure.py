@@ -8,11 +8,10 @@ from pathlib import Path
 
 import torch
 
-from vusfa.errors import ResultError
 from vusfa.evaluation.baselines import RANDOM_WALK, SHORTEST_PATH
 from vusfa.evaluation.exact import expected_walks
 from vusfa.evaluation.statistics import Estimate, Sums, bootstrap_mean
-from vusfa.experiments.runs import Run, read_runs
+from vusfa.experiments.runs import Run, no_results, read_runs
 from vusfa.experiments.transfer import (
     FINE_TUNED,
     FROM_SCRATCH,
@@ -21,7 +20,7 @@ from vusfa.experiments.transfer import (
     curves_of,
     frames_to,
 )
-from vusfa.files import replacing
+from vusfa.files import check_file, replacing
 from vusfa.report.markdown import markdown
 from vusfa.scenes import SceneSet
 
@@ -216,9 +215,10 @@ def show_transfer(
         scenes: bundled names and files, in order; the bundled rooms that the runs name when not given.
         out: the picture.
     """
+    check_file(out)
     found = read_runs(results, experiment)
     if not found:
-        raise ResultError(f"{results / experiment}: no results; run vusfa transfer run first")
+        raise no_results(results, experiment, command="vusfa transfer run")
     world = SceneSet.open(scenes or found[0].info["scenes"])
     print(*transfer_tables(found, world, threshold), sep="\n\n")
     bounds = baseline_lengths(found, world)

@@ -55,6 +55,7 @@ def download(
     progress: Callable[[int, int], None] | None = None,
     sleep: Callable[[float], None] = time.sleep,
     begins: bytes = b"",
+    most: int = MAX_ARCHIVE_BYTES,
 ) -> None:
     """Download a file, resuming an earlier attempt; the target appears when it is complete.
 
@@ -65,6 +66,7 @@ def download(
         progress: called with bytes received and bytes in total (0 when the server does not say).
         sleep: waits between two tries.
         begins: first bytes of every such file; what begins otherwise is refused with its first block.
+        most: bytes of the largest such file; a body that does not end is refused there.
 
     Raises:
         SceneError: nothing new came in ``patience.attempts`` tries, or the server refuses; what has arrived
@@ -76,7 +78,7 @@ def download(
     while True:
         before = part.size
         try:
-            _transfer(requests, url, part, patience, progress or (lambda done, total: None), begins)
+            _transfer(requests, url, part, patience, progress or (lambda done, total: None), begins, most)
             part.finish()
             return
         except _Refused as refusal:
@@ -151,6 +153,7 @@ def _transfer(
     patience: Patience,
     progress: Callable[[int, int], None],
     begins: bytes,
+    most: int,
 ) -> None:
     """One connection: request what is missing, write it as it arrives.
 
@@ -180,6 +183,8 @@ def _transfer(
         length = answer.headers.get("Content-Length", "")
         total = part.size + int(length) if length.isdecimal() and len(length) < 20 else 0
         done = part.size
+        if total > most:
+            raise _Refused(f"the file has {total} bytes, more than {most}")
         require_space(part.path.parent, total - done if total else 0)
         progress(done, total)
         with open(part.path, "ab") as file:
@@ -189,9 +194,9 @@ def _transfer(
                     raise _Refused(f"the file begins with {brief(block[:16])}, not with {begins!r}")
                 file.write(block)
                 done += len(block)
-                if max(done, total) > MAX_ARCHIVE_BYTES:
+                if done > most:
                     part.discard()
-                    raise _Refused(f"the file has more than {MAX_ARCHIVE_BYTES} bytes")
+                    raise _Refused(f"the file has more than {most} bytes")
                 if number % 256 == 0:
                     require_space(part.path.parent, 0)
                 progress(done, total)

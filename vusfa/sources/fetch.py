@@ -18,7 +18,8 @@ from pathlib import Path, PurePosixPath
 from typing import IO, Any
 
 from vusfa.errors import ConfigError, SceneError
-from vusfa.limits import MAX_STATE_BYTES, brief
+from vusfa.files import check_folder
+from vusfa.limits import MAX_ARCHIVE_BYTES, MAX_STATE_BYTES, brief
 from vusfa.reading import BoundedZip, read_yaml
 from vusfa.scenes import store
 from vusfa.scenes.hdf5 import opened
@@ -152,19 +153,20 @@ def fetch(
     if all(t.exists() and not arrived_faults(t, archive.scenes[n]) for n, t in targets.items()):
         report(f"{folder}: all scenes are there and sound")
         return list(targets.values())
+    check_folder(folder, "the folder of the scenes")
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise SceneError(f"{folder}: cannot be made ({error}); give another folder") from error
-    packed = folder / archive.archive
-    failures = []
+    packed, failures = folder / archive.archive, []
+    most = min(MAX_ARCHIVE_BYTES, sum(archive.scenes.values()) * MAX_STATE_BYTES)
     for url in mirrors or archive.mirrors:
         # An archive that fails is thrown away, whoever it came from, and this mirror asked for a new one.
         for attempt in ("found here", "fetched"):
             try:
                 if not packed.exists():
                     report(f"fetching {url}")
-                    download(url, packed, archive.patience, progress, sleep, begins=b"PK")
+                    download(url, packed, archive.patience, progress, sleep, begins=b"PK", most=most)
                     attempt = "fetched"
                 report(f"unpacking and checking {packed.name}")
                 _admit(packed, archive, targets)

@@ -38,6 +38,7 @@ import torch
 from torch import Tensor
 
 from vusfa.conf.settings import flat
+from vusfa.envs.scene_env import usable_device
 from vusfa.errors import CheckpointError, SceneError, VusfaError
 from vusfa.files import replacing
 from vusfa.limits import brief, listing, one_line
@@ -107,7 +108,7 @@ def load_checkpoint(path: str | Path, device: torch.device | str = "cpu") -> dic
     Raises:
         CheckpointError: there is no such file, it is damaged, or it is no checkpoint of this package.
     """
-    path = checkpoint_file(path)
+    path, device = checkpoint_file(path), usable_device(device)
     if not os.path.isfile(path):  # Path.is_file raises in a folder that may not be looked into
         raise CheckpointError(f"{path}: no such checkpoint; vusfa train writes RUN/checkpoint.pt")
     state = read_content(path, device)
@@ -222,7 +223,6 @@ def load_agent(
         CheckpointError: the file is damaged, or of other scenes.
         SceneError: its scenes are not where they were.
     """
-    device = torch.device(device)
     state = load_checkpoint(path, device)
     if scenes is None:
         try:

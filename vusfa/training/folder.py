@@ -14,7 +14,7 @@ from typing import Any
 
 from vusfa.cluster.locks import FileLock, LockedError
 from vusfa.errors import ConfigError
-from vusfa.files import check_folder, remove_leftovers
+from vusfa.files import check_file, check_folder, remove_leftovers
 
 __all__ = ["AUTO", "BEST", "CHECKPOINT", "EPISODES", "RunFolder", "default_folder", "found_checkpoint"]
 
@@ -81,6 +81,8 @@ class RunFolder:
         self._make()
         self._refuse_other_run()
         remove_leftovers(self.path)
+        for name in ("config.json", *_OF_A_RUN, *_EVALUATION):
+            check_file(self.path / name)
         if self._settings["overwrite"] and not self._resumes_here():
             for name in (*_OF_A_RUN, *_EVALUATION):
                 with suppress(OSError):

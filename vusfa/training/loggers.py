@@ -9,17 +9,22 @@ tables nor checkpoints as artifacts, encode films with moviepy, and log a resume
 from __future__ import annotations
 
 import csv
+import io
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Protocol
 
 from vusfa.errors import ConfigError, ResultError, VusfaError
-from vusfa.files import cannot_write, say, write_csv, write_json
+from vusfa.files import cannot_write, check_file, say, write_csv, write_json
+from vusfa.limits import MAX_LOG_BYTES, one_line
+from vusfa.reading import open_regular
 from vusfa.training.trackers import TensorBoardLogger, WandbLogger
 
 __all__ = ["CSVLogger", "Logger", "Loggers", "make_loggers"]
+
+_AWAY = "move it away, and the run begins another"
 
 
 class Logger(Protocol):
@@ -78,6 +83,9 @@ class CSVLogger:
         self._resume_frames = resume_frames
         self._columns: list[str] | None = None
         self._begun = False
+        if resume_frames is not None and check_file(self._file).exists():
+            for _ in self._kept():  # what cannot be read shows before any work
+                pass
 
     def _begin(self) -> None:
         """Create the files at the first call: a training that cannot begin leaves none."""
@@ -85,14 +93,30 @@ class CSVLogger:
             return
         self._begun = True
         write_json(self.folder / "config.json", self._config)
-        if self._resume_frames is None:
+        if self._columns:
+            write_csv(self._file, self._kept(), self._columns)
+        else:
             self._file.unlink(missing_ok=True)
-        elif self._file.is_file():
-            with open(self._file, newline="", encoding="utf-8") as file:
-                reader = csv.DictReader(file)
-                kept = [row for row in reader if _frames(row) <= self._resume_frames]
+
+    def _kept(self) -> Iterator[dict[str, str]]:
+        """Rows of the file up to the frames of the checkpoint, one at a time."""
+        place = 1
+        try:
+            with open_regular(self._file, MAX_LOG_BYTES) as binary:
+                reader = csv.DictReader(io.TextIOWrapper(binary, encoding="utf-8", newline=""))
                 self._columns = list(reader.fieldnames or ()) or None
-            write_csv(self._file, kept, self._columns)
+                for row in reader:
+                    place = reader.line_num
+                    if None not in row.values() and (  # else cut off in the writing
+                        self._resume_frames is None or int(row["frames"] or 0) <= self._resume_frames
+                    ):
+                        yield {name: row[name] for name in self._columns or ()}
+        except KeyError as fault:
+            raise ResultError(f"{self._file}: it has no column {fault}; {_AWAY}") from fault
+        except (OSError, ValueError, csv.Error) as fault:
+            raise ResultError(
+                f"{self._file}: cannot be read, row {place} ({one_line(fault)}); {_AWAY}"
+            ) from fault
 
     def log_metrics(self, metrics: Mapping[str, float], frames: int) -> None:
         """Append one row; a column that earlier rows do not have is empty there.
@@ -105,10 +129,9 @@ class CSVLogger:
         if self._columns is not None and not self._file.is_file():
             raise ResultError(f"{self._file}: removed or renamed since the run began; its folder must stay")
         if self._columns is not None and set(row) - set(self._columns):
-            with open(self._file, newline="", encoding="utf-8") as file:
-                earlier = list(csv.DictReader(file))
-            self._columns = list(dict.fromkeys([*self._columns, *row]))
-            write_csv(self._file, earlier, self._columns)
+            self._resume_frames, columns = None, list(dict.fromkeys([*self._columns, *row]))
+            write_csv(self._file, self._kept(), columns)
+            self._columns = columns
         try:
             with open(self._file, "a", newline="", encoding="utf-8") as file:
                 writer = csv.DictWriter(file, self._columns or list(row), lineterminator="\n")
@@ -233,9 +256,3 @@ def make_loggers(
         except ImportError as error:
             raise ConfigError(f"logger {kind} needs {error.name}; pip install 'vusfa[recipes]'") from error
     return Loggers(loggers)
-
-
-def _frames(row: Mapping[str, str | None]) -> int:
-    """Frames of a row of ``metrics.csv``; a row that was cut off in the writing counts as later than all."""
-    complete = None not in row.values()
-    return int(row["frames"] or 0) if complete else 1 << 62

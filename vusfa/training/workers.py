@@ -19,7 +19,7 @@ from types import FrameType
 from typing import Any
 
 import torch
-from torchrl.collectors import BaseCollector
+from torchrl.collectors import BaseCollector, MultiSyncCollector
 
 from vusfa.errors import VusfaError, WorkerError
 
@@ -119,7 +119,8 @@ def watch(collector: BaseCollector, limit: float | None) -> None:
         limit: seconds without a batch after which a worker counts as dead; None: any time.
     """
     if hasattr(collector, "procs"):
-        collector.queue_out = _WatchedQueue(collector.queue_out, collector.procs, limit)
+        in_rounds = isinstance(collector, MultiSyncCollector)
+        collector.queue_out = _WatchedQueue(collector.queue_out, collector.procs, limit, in_rounds)
 
 
 @contextmanager
@@ -144,35 +145,44 @@ class Silence:
     Args:
         workers: their processes.
         limit: seconds after which a silent one counts as dead; None: any time.
+        in_rounds: they wait for each other: who has sent something in a round is not silent.
     """
 
-    def __init__(self, workers: Sequence[Any], limit: float | None) -> None:
+    def __init__(self, workers: Sequence[Any], limit: float | None, in_rounds: bool = False) -> None:
         self._workers, self._limit = workers, limit
+        self._in_rounds, self._sent = in_rounds, set[int]()
         self._clock, self._last = 0.0, time.monotonic()
         self._heard = [0.0] * len(workers)
 
     def ends(self, index: int, *, for_good: bool = False) -> None:
         """A worker has sent something, or will send no more."""
         self._heard[index] = math.inf if for_good else self._clock
+        if self._in_rounds:
+            self._sent = self._sent | {index} if len(self._sent) < len(self._workers) else {index}
 
     def check(self) -> None:
-        """Raise a WorkerError that names the workers which have been silent for too long."""
+        """Raise a WorkerError that names the workers which have been silent for too long: of these the one
+        that a signal has stopped, where there is one, for others may only wait for its lock."""
         now = time.monotonic()
         self._clock += min(now - self._last, LONGEST_WAIT)
         self._last = now
         silent = [i for i, heard in enumerate(self._heard) if self._clock - heard > (self._limit or math.inf)]
+        silent = [i for i in silent if i not in self._sent or len(self._sent) == len(self._workers)]
         if silent:
-            named = ", ".join(f"{index} (process {self._workers[index].pid})" for index in silent)
-            raise WorkerError(
-                f"worker {named} of the collector has sent nothing for {self._limit:g} s (collector.timeout)"
-            )
+            stopped = [index for index in silent if _is_stopped(self._workers[index].pid)]
+            named = ", ".join(f"{i} (process {self._workers[i].pid})" for i in stopped or silent)
+            why = "" if stopped or len(silent) == 1 else "; which of them the others wait for cannot be known"
+            how = f"{'is stopped by a signal and ' if stopped else ''}has sent nothing for {self._limit:g} s"
+            raise WorkerError(f"worker {named} of the collector {how} (collector.timeout){why}")
 
 
 class _WatchedQueue:
     """The queue on which workers announce their batches."""
 
-    def __init__(self, results: Any, workers: Sequence[Any], limit: float | None) -> None:
-        self._results, self._workers, self._silence = results, workers, Silence(workers, limit)
+    def __init__(
+        self, results: Any, workers: Sequence[Any], limit: float | None, in_rounds: bool = False
+    ) -> None:
+        self._results, self._workers, self._silence = results, workers, Silence(workers, limit, in_rounds)
 
     def get(self, timeout: float | None = None) -> Any:
         """As a queue's ``get``.
@@ -185,9 +195,8 @@ class _WatchedQueue:
         except queue.Empty:
             self._look()
             raise
-        announced = item[0][1] if isinstance(item[0], tuple) else item[0]
+        self._silence.ends(item[0][1] if isinstance(item[0], tuple) else item[0])
         self._look()
-        self._silence.ends(announced)
         return item
 
     def _look(self) -> None:
@@ -204,6 +213,15 @@ class _WatchedQueue:
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._results, name)
+
+
+def _is_stopped(pid: int) -> bool:
+    """Whether a process is stopped (SIGSTOP, a debugger); false where the system does not say."""
+    try:
+        with open(f"/proc/{pid}/stat", "rb") as file:
+            return file.read().rpartition(b") ")[2][:1] in (b"T", b"t")
+    except OSError:
+        return False
 
 
 def _dead(workers: Sequence[Any]) -> str | None:
