@@ -78,6 +78,8 @@ MAX_FURNITURE = 1000
 
 #: Size and number of elements of all arrays of a file together; readers widen elements to 8 bytes.
 MAX_NPZ_BYTES, MAX_NPZ_ELEMENTS = 1 << 28, 1 << 26
+#: Size of the names and attributes of all rooms in an index, JSON.
+MAX_INDEX_TEXT_BYTES = 1 << 25
 
 # ---- archives (zip)
 

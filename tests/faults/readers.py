@@ -32,6 +32,7 @@ from vusfa.report.curve import read_metrics
 from vusfa.report.runs import read_episodes
 from vusfa.report.runs import read_run as read_logged_run
 from vusfa.scenes import Scene, SceneSet, validate
+from vusfa.scenes.index import INDEX, read_index, write_index
 from vusfa.scenes.pictures import decode
 from vusfa.sources.compact import compact
 from vusfa.sources.download import Patience
@@ -213,6 +214,23 @@ def _decode(path: Path) -> None:
         raise SceneError(str(error)) from error
 
 
+def _index(folder: Path) -> Path:
+    for name in ("a.h5", "b.h5"):
+        _scene().save(folder / name)
+    write_index(folder, {name: Scene.load(folder / name, lazy=True) for name in ("a.h5", "b.h5")})
+    return folder / INDEX
+
+
+def _read_index(path: Path) -> None:
+    found = read_index(path.parent)
+    if found is None:  # as where there is none
+        raise SceneError("the index is not believed")
+    for dump in found.values():
+        scene = Scene.of_dump(dump)
+        SceneSet([scene])
+        assert not dump.faults()
+
+
 _ROOMS = SceneSet([_scene()])
 
 
@@ -261,6 +279,7 @@ READERS: dict[str, Reader] = {
     "agent": Reader("safetensors", _agent_file, lambda path: open_agent(path, _ROOMS)),
     "scene": Reader("hdf5", _jpeg_scene, _read_scene),
     "scene, raw": Reader("hdf5", _raw_scene, _read_scene),
+    "index": Reader("npz", _index, _read_index),
     "compact": Reader("hdf5", _jpeg_scene, _compact),
     "fetch": Reader("zip", _archive, _fetch),
     "archives": Reader(

@@ -12,6 +12,7 @@ from typing import Any
 
 from vusfa.errors import SceneError
 from vusfa.limits import LAZY_SCENES, MAX_FAULTS, brief
+from vusfa.scenes.index import SceneIndex
 from vusfa.scenes.scene import Scene
 
 __all__ = ["Sources", "expanded", "files_in", "listed", "open_scenes"]
@@ -72,17 +73,22 @@ def open_scenes(
     for name, most in Counter(filter(None, map(os.fspath, given))).most_common(1):
         if most > 1:
             raise SceneError(f"{most} scenes are called {brief(Path(name).stem)}, of one file; name it once")
-    for source in given:
-        try:
-            scene = Scene.open(source, lazy)
-            if skip_broken and lazy:
-                _ = scene.features  # checked now, because later it could not be left out
-            opened.append(scene)
-            sources.append(os.fspath(source))
-        except SceneError as error:
-            if not skip_broken:
-                raise
-            faults.append(error)
+    index = SceneIndex(given) if lazy else None
+    try:
+        for source in given:
+            try:
+                scene = (index and index.scene(source)) or Scene.open(source, lazy)
+                if skip_broken and lazy:
+                    _ = scene.features  # checked now, because later it could not be left out
+                opened.append(scene)
+                sources.append(os.fspath(source))
+            except SceneError as error:
+                if not skip_broken:
+                    raise
+                faults.append(error)
+    finally:
+        if index is not None:
+            index.keep(sources, opened)
     if faults:
         listing = "".join(f"\n  - {fault}" for fault in faults[:MAX_FAULTS])
         warnings.warn(f"{len(faults)} scenes cannot be opened and are left out:{listing}", stacklevel=3)

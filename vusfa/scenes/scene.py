@@ -129,11 +129,21 @@ class Scene:
         """
         dump = store.read(path, lazy)
         raise_faults(path, dump.faults())
+        return cls.of_dump(dump, Path(path))
+
+    @classmethod
+    def of_dump(cls, dump: store.Dump, path: Path | None = None) -> Scene:
+        """The scene of a dump that has been checked, without another copy or check.
+
+        Args:
+            dump: which the scene then owns.
+            path: the file that pictures are read from; that of the features by default.
+        """
         scene = object.__new__(cls)
-        fields = {"attributes": dump.attributes, "path": Path(path), "picture_shape": dump.picture_shape}
-        for key, value in {"name": dump.name, **fields}.items():
-            object.__setattr__(scene, key, value)
-        scene._set(dump.arrays, dump.actions, dump.stored)  # without another copy or check
+        vars(scene).update(
+            name=dump.name, attributes=dump.attributes, path=path, picture_shape=dump.picture_shape
+        )
+        scene._set(dump.arrays, dump.actions, dump.stored)
         return scene
 
     @classmethod
