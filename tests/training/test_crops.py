@@ -157,3 +157,33 @@ def test_an_agent_that_is_handed_features_is_evaluated_on_the_first_crop(room: P
         drawn = trainer.update(batches)[0]
     first = trainer.scenes.features[drawn["goal_id"], 0]
     assert not torch.equal(drawn["goal_observation"], first)
+
+
+def test_dropout_of_features_is_drawn_for_every_step_and_evaluation_has_none(room: Path) -> None:
+    trainer = made(room, "env.crop_dropout=0.5")
+    table = frames(trainer).lookup(None).clone()
+    trainer.algorithm.show_crops()
+    one = frames(trainer).lookup(None).clone()
+    trainer.algorithm.show_crops()
+    other = frames(trainer).lookup(None)
+    assert torch.allclose(one, torch.where(one == 0, 0.0, 2 * table))
+    assert 0.3 < float((one == 0).float().mean()) < 0.7
+    assert not torch.equal(one == 0, other == 0)
+    trainer.agent.eval()
+    assert torch.equal(frames(trainer).lookup(None), table)
+
+
+@pytest.mark.parametrize(
+    ("overrides", "told"),
+    [
+        (["env.crop_dropout=-1"], r"env.crop_dropout is -1.0; give a number from 0 to below 1"),
+        (["env.crop_dropout=nan"], r"env.crop_dropout is nan; give a number from 0 to below 1"),
+        (
+            ["env.crop_dropout=0.5", "agent.observation=features"],
+            "env.crop_dropout is 0.5: only an agent that reads",
+        ),
+    ],
+)
+def test_dropout_that_makes_no_sense_is_refused(room: Path, overrides: list[str], told: str) -> None:
+    with pytest.raises(ConfigError, match=told):
+        made(room, *overrides)

@@ -70,18 +70,21 @@ class Algorithm:
 
     def show_crops(self) -> None:
         """Show an agent that reads ids other crops than the first, as ``env.crop`` says: in training mode it
-        sees every state, as state and as goal, in that crop, or in one drawn anew at each call.
+        sees every state, as state and as goal, in that crop, or in one drawn anew at each call, without a
+        share ``env.crop_dropout`` of its features, which each call draws anew, too.
 
         Agents that are handed features get theirs from :class:`~vusfa.envs.SceneObservation`.
         """
-        crop = crop_index(self.settings["env"]["crop"], self.scenes.num_crops)
+        task = self.settings["env"]
+        crop, dropout = crop_index(task["crop"], self.scenes.num_crops), task.get("crop_dropout", 0.0)
         frames = getattr(getattr(self.agent, "encoder", None), "frames", None)  # an extension may have none
-        if crop == 0 or not isinstance(frames, FeatureFrames) or not frames.num_states:
+        shown = crop != 0 or dropout
+        if not shown or not isinstance(frames, FeatureFrames) or not frames.num_states:
             return
         features = self.scenes.features
         number, crops = features.shape[:2]
         drawn = torch.randint(crops, (number,)) if crop is None else torch.full((number,), crop)
-        frames.show(features[torch.arange(number), drawn])
+        frames.show(features[torch.arange(number), drawn], dropout)
 
     def schedule(self, frames: int) -> None:
         """Set what depends on the number of frames trained on, such as a coefficient."""

@@ -102,7 +102,7 @@ def render(
         str | None,
         typer.Option(
             help="Change the pictures, not the states: noise, brighter, dimmer, camera, fov, moved, jpeg,"
-            " blur, all, train1, train2, or a YAML file of changes."
+            " blur, all, train1 to train6, validate1, validate2, or a YAML file of changes."
         ),
     ] = None,
     backbone: Annotated[

@@ -68,6 +68,7 @@ class EnvSettings:
     goal_reward: float
     step_reward: float
     collision_reward: float | None
+    crop_dropout: float = 0.0
     max_steps: int = MAX_STEPS
     active_scenes: int | None = None
     scene_stay: int = 100_000

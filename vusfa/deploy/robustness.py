@@ -126,7 +126,9 @@ def robustness(
                     seed=seed,
                     progress=partial(progress, mode),
                 )
-    facts = run_facts(state, [f"env.crop={state['config']['env']['crop']}"])
+    task = state["config"]["env"]
+    said = [f"env.{key}={task[key]}" for key in ("crop", "crop_dropout") if key in task]
+    facts = run_facts(state, said)
     info = {**facts, "row": name, "changes": list(worlds), "changed": _variations(worlds)}
     walk = exact_goals(uniform_probabilities(own.num_actions), own)
     print(write_run(results, Run("robustness", f"{name}-{facts['seed']}", info, tables, walk)))

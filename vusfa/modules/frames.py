@@ -111,12 +111,14 @@ class FeatureFrames(_Frames):
         assert self._features is not None
         return self.encode(self._features.of_scene(scene)[:, 0].to(self.table.device))
 
-    def show(self, features: Tensor | None) -> None:
+    def show(self, features: Tensor | None, dropout: float = 0.0) -> None:
         """Look up other features in training mode; evaluation mode looks up crop 0.
 
         Args:
             features: (S, F) of all states, as the scenes have them, such as a crop of each drawn at random;
                 None: crop 0 again.
+            dropout: probability with which a feature of a state is 0, its mean with ``normalize``; the others
+                grow by 1 / (1 - dropout).
 
         >>> frames = FeatureFrames(torch.zeros(3, 2, 8))
         >>> frames.show(torch.ones(3, 8))
@@ -124,6 +126,8 @@ class FeatureFrames(_Frames):
         (tensor(8.), tensor(0.))
         """
         self._shown = None if features is None else self.encode(features.to(self.table.device))
+        if self._shown is not None and dropout:
+            self._shown = functional.dropout(self._shown, dropout)
         self._converted = None
 
     def train(self, mode: bool = True) -> FeatureFrames:

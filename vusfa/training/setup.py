@@ -82,7 +82,15 @@ def make_trainer(
     note = None if settings["resume"] else algorithm.prepare()
     if ranks.size > 1:
         algorithm.share_statistics(ranks.mean)
-    crop = task.pop("crop")
+    crop, dropout = task.pop("crop"), task.pop("crop_dropout", 0.0)
+    if not 0 <= dropout < 1:
+        raise ConfigError(f"env.crop_dropout is {dropout}; give a number from 0 to below 1")
+    if dropout and (
+        scenes.is_lazy or (agent.config["observation"], agent.config["encoder"]) != ("index", "mlp")
+    ):
+        raise ConfigError(
+            f"env.crop_dropout is {dropout}: only an agent that reads ids of scenes in memory sees it; give 0"
+        )
     observation = make_observation(agent, scenes, crop)
     transforms = [*([observation] if observation is not None else []), *agent.make_env_transforms()]
     env = partial(make_env, scenes, transforms, history=agent.config["history"], device=device, **task)

@@ -112,7 +112,8 @@ def test_jpeg_changes_what_its_quality_takes() -> None:
 
 
 def test_noise_seeds_share_no_seed_of_a_state() -> None:
-    assert len({variation.noise_seed for variation in VARIATIONS.values()}) == 4
+    apart = [v.noise_seed for name, v in VARIATIONS.items() if name.startswith(("train", "validate"))]
+    assert len({0, 1, *apart}) == 2 + len(apart) == 10
     seeds = {Variation(noise_seed=k).seed(state) for k in (0, 1, 42_948) for state in (0, 1, 99_999)}
     assert len(seeds) == 9
     assert max(seeds) < 2**32

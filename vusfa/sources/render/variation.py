@@ -79,7 +79,8 @@ class Variation:
 #: No change.
 PLAIN = Variation()
 
-#: The changes of the robustness set by name; then other noise for training.
+#: The changes of the robustness set by name; then those for training, with other draws and sizes, and two
+#: for choosing settings, so that nothing is chosen on the robustness set itself.
 VARIATIONS = {
     "noise": Variation(noise_seed=1),
     "brighter": Variation(lamps=1.3),
@@ -90,8 +91,14 @@ VARIATIONS = {
     "jpeg": Variation(jpeg=60),
     "blur": Variation(blur=0.03),
     "all": Variation(1, 0.7, 0.15, 0.1, 5.0, 1.05, 0.3, 60, 0.03),
-    "train1": Variation(noise_seed=2),
-    "train2": Variation(noise_seed=3),
+    "train1": Variation(2, 1.2, offset=0.06, turn=4.0, fov=0.95, moved=0.2),
+    "train2": Variation(3, 0.8, 0.1, offset=0.12, turn=7.0, fov=1.08, moved=0.4),
+    "train3": Variation(12, 0.75, 0.1, offset=0.1, turn=3.0, fov=1.03, moved=0.35),
+    "train4": Variation(13, offset=0.08, turn=5.5, fov=1.1, moved=0.15),
+    "train5": Variation(14, 1.35, offset=0.12, turn=2.0, fov=0.97),
+    "train6": Variation(15, 0.65, 0.2, offset=0.05, turn=8.0),
+    "validate1": Variation(4, offset=0.09, turn=6.0),
+    "validate2": Variation(5, 0.75, 0.2, 0.08, 6.0, 1.07, 0.25, 55, 0.035),
 }
 
 
