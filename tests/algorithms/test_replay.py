@@ -11,7 +11,8 @@ from hypothesis import strategies as st
 from tensordict import TensorDict
 
 from vusfa.algorithms import HindsightReplay, HindsightSampler
-from vusfa.algorithms.replay import merge_replays, share_of_replay, steps_ahead
+from vusfa.algorithms.hindsight_goals import steps_ahead
+from vusfa.algorithms.replay import merge_replays, share_of_replay
 from vusfa.errors import ConfigError
 
 ENVS, LONG = 3, 40

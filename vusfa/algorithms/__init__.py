@@ -1,13 +1,16 @@
 """Algorithms: the losses of a batch, of replay, and what follows a step; a registry of them.
 
 >>> sorted(ALGORITHMS)
-['autoencoder', 'hindsight', 'replay_search', 'usf']
+['autoencoder', 'contrastive', 'hindsight', 'replay_search', 'usf']
 """
 
 from vusfa.algorithms.autoencoder import Autoencoder
 from vusfa.algorithms.base import Algorithm, AlgorithmSettings
+from vusfa.algorithms.contrastive import Contrastive
 from vusfa.algorithms.experience import ExperienceGraph
+from vusfa.algorithms.goal_learning import GoalLearning, GoalLearningSettings
 from vusfa.algorithms.hindsight import Hindsight
+from vusfa.algorithms.hindsight_goals import HindsightSampler
 from vusfa.algorithms.registry import (
     ALGORITHMS,
     LOSS_TERMS,
@@ -16,7 +19,7 @@ from vusfa.algorithms.registry import (
     register_algorithm,
     register_loss_term,
 )
-from vusfa.algorithms.replay import HindsightReplay, HindsightSampler
+from vusfa.algorithms.replay import HindsightReplay
 from vusfa.algorithms.replay_search import ReplaySearch
 from vusfa.algorithms.schedule import annealed, threads_per_step
 from vusfa.algorithms.usf import USF, make_usf_loss
@@ -28,7 +31,10 @@ __all__ = [
     "Algorithm",
     "AlgorithmSettings",
     "Autoencoder",
+    "Contrastive",
     "ExperienceGraph",
+    "GoalLearning",
+    "GoalLearningSettings",
     "Hindsight",
     "HindsightReplay",
     "HindsightSampler",

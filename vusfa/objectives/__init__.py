@@ -16,6 +16,7 @@ from vusfa.objectives.hindsight import HindsightLoss, expectile_loss, relabelled
 from vusfa.objectives.optim import DualAscent, TFRMSprop
 from vusfa.objectives.returns import USFEstimator
 from vusfa.objectives.reward import RewardRegressionLoss, reward_regression_loss
+from vusfa.objectives.scores import ScoreLoss
 from vusfa.objectives.search import SearchLoss, best_action_log_prob
 from vusfa.objectives.usf import USFLoss
 
@@ -24,6 +25,7 @@ __all__ = [
     "DualAscent",
     "HindsightLoss",
     "RewardRegressionLoss",
+    "ScoreLoss",
     "SearchLoss",
     "TFRMSprop",
     "USFEstimator",

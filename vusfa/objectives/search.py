@@ -15,12 +15,12 @@ from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import dispatch
 from tensordict.utils import NestedKey
 from torch import Tensor
-from torch.distributions import Distribution
 
 from vusfa.objectives.functional import assert_same_shape
 from vusfa.objectives.goal_loss import GoalLoss, weighted_mean
 from vusfa.objectives.hindsight import walked_return
 from vusfa.objectives.networks import entry, run_actor_critic, select_inputs
+from vusfa.objectives.scores import finite_logits
 
 __all__ = ["SearchKeys", "SearchLoss", "best_action_log_prob"]
 
@@ -131,7 +131,7 @@ class SearchLoss(GoalLoss):
         with self._params_in_place():
             inputs = select_inputs(tensordict, *actor.in_keys, *critic.in_keys)
             distribution, written = run_actor_critic(actor, critic, inputs)
-        logits, value = _logits(distribution), self._value(written)
+        logits, value = finite_logits("SearchLoss", distribution), self._value(written)
         assert_same_shape("SearchLoss", best_action=best, logits=logits)
         assert_same_shape("SearchLoss", steps_to_goal=steps, state_value=value)
         with torch.no_grad():
@@ -149,14 +149,3 @@ class SearchLoss(GoalLoss):
         out.set("search_accuracy", weighted_mean(1.0, hit, counts))
         self._clear_weakrefs(tensordict, out, "actor_network_params", "critic_network_params")
         return out
-
-
-def _logits(distribution: Distribution) -> Tensor:
-    """Logits (*batch, A), float32 or more."""
-    logits = getattr(distribution, "logits", None)
-    if logits is None:
-        raise TypeError(
-            f"SearchLoss: the policy's distribution is {type(distribution).__name__}, which has no logits;"
-            " give a policy over a finite set of actions"
-        )
-    return logits.to(torch.promote_types(logits.dtype, torch.float32))
