@@ -42,6 +42,7 @@ from vusfa.sources.photos import fit_picture, read_features
 from vusfa.sources.render.plan_file import load_plan
 from vusfa.sources.row_log import RowLog
 from vusfa.training import Trainer, load_agent, make_trainer
+from vusfa.training.loggers import CSVLogger
 
 __all__ = ["READERS", "Reader"]
 
@@ -124,6 +125,12 @@ def _run_folder(folder: Path) -> Path:
     return write_run(
         folder, Run("table1", "usfa-0", {"model": "usfa", "seed": 0}, {"sampled": episodes}, exact)
     )
+
+
+def _go_on(path: Path) -> None:
+    log = CSVLogger(path.parent, {}, resume_frames=10)
+    log.log_metrics({"success": 0.5, "loss": 0.1}, 20)
+    log.log_metrics({"success": 0.5, "loss": 0.1, "kl": 0.1}, 30)
 
 
 def _of_a_run(name: str) -> Reader:
@@ -302,6 +309,7 @@ READERS: dict[str, Reader] = {
     "episodes": _of_a_run("sampled.npz"),
     "exact": _of_a_run("exact.npz"),
     "metrics.csv": Reader("csv", _text("metrics.csv", "frames,success\n10,0.5\n20,\n"), read_metrics),
+    "resumed log": Reader("csv", _text("metrics.csv", "frames,success\n10,0.5\n20,\n"), _go_on),
     "episodes.csv": Reader("csv", _text("episodes.csv", _EPISODES), lambda path: read_episodes(path, 9)),
     "config.json": Reader("json", _logged_run, lambda path: read_logged_run(path.parent)),
     "zero_shot.json": Reader(

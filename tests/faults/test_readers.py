@@ -14,7 +14,7 @@ NAMES = [
     "checkpoint", "agent",
     "scene", "scene, raw", "index", "compact", "fetch", "archives", "picture", "features", "poses", "edges",
     "row log", "plan", "goals", "goal names", "manifest", "cell.json", "episodes", "exact", "metrics.csv",
-    "episodes.csv", "config.json", "zero_shot.json",
+    "resumed log", "episodes.csv", "config.json", "zero_shot.json",
 ]  # fmt: skip
 CASES = 40
 

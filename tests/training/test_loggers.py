@@ -323,7 +323,7 @@ def test_an_exception_closes_loggers_with_a_failure():
         (b"frames,loss\n24,0.5\n\xff\xfe\x00junk\n", "cannot be read, row 1 ('utf-8' codec can't decode"),
         (b"frames,loss\n24,0.5\nx,0.5\n", "cannot be read, row 3 (invalid literal for int()"),
         (b"frames,loss\n" + b"9" * 5000 + b",0.5\n", "cannot be read, row 2 (Exceeds the limit"),
-        (b"loss\n0.5\n", "it has no column 'frames'"),
+        (b"loss\n0.5\n", "cannot be read, row 1 ('frames' is not in list)"),
         (b"frames\n" + b"1" * 200_000, "cannot be read, row 1 (field larger than field limit"),
         ("pipe", "is no regular file"),
         ("folder", "is a folder"),

@@ -100,22 +100,24 @@ class CSVLogger:
 
     def _kept(self) -> Iterator[dict[str, str]]:
         """Rows of the file up to the frames of the checkpoint, one at a time."""
-        place = 1
+        number = 1
         try:
             with open_regular(self._file, MAX_LOG_BYTES) as binary:
-                reader = csv.DictReader(io.TextIOWrapper(binary, encoding="utf-8", newline=""))
-                self._columns = list(reader.fieldnames or ()) or None
-                for row in reader:
-                    place = reader.line_num
-                    if None not in row.values() and (  # else cut off in the writing
-                        self._resume_frames is None or int(row["frames"] or 0) <= self._resume_frames
-                    ):
-                        yield {name: row[name] for name in self._columns or ()}
-        except KeyError as fault:
-            raise ResultError(f"{self._file}: it has no column {fault}; {_AWAY}") from fault
+                reader = csv.reader(io.TextIOWrapper(binary, encoding="utf-8", newline=""))
+                names = next(reader, None)
+                if names is None:
+                    return
+                place = names.index("frames")
+                # once it was written again, its names are :func:`~vusfa.errors.printable`
+                self._columns, last = self._columns or names, self._resume_frames
+                for fields in reader:
+                    number = reader.line_num
+                    is_whole = len(fields) >= len(names)  # else cut off in the writing
+                    if is_whole and (last is None or int(fields[place] or 0) <= last):
+                        yield dict(zip(self._columns, fields, strict=False))
         except (OSError, ValueError, csv.Error) as fault:
             raise ResultError(
-                f"{self._file}: cannot be read, row {place} ({one_line(fault)}); {_AWAY}"
+                f"{self._file}: cannot be read, row {number} ({one_line(fault)}); {_AWAY}"
             ) from fault
 
     def log_metrics(self, metrics: Mapping[str, float], frames: int) -> None:
