@@ -20,7 +20,7 @@ from omegaconf import OmegaConf
 from vusfa.cli.launch import compose
 from vusfa.errors import ResultError, WorkerError
 from vusfa.training import StopOnSignal, Trainer, load_checkpoint, make_trainer, run_training
-from vusfa.training.workers import Silence, _WatchedQueue, started
+from vusfa.training.workers import Silence, _WatchedQueue, begin_worker, started
 
 SMALL = ["agent.hidden_size=8", "agent.embedding_size=8", "agent.history=1", "env.goals=[3,9,12]"]
 SMALL += ["collector.num_envs=6", "collector.rollout=4", "scenes=[bathroom]", "total_frames=1000000"]
@@ -183,3 +183,52 @@ def test_where_the_silent_one_cannot_be_known_it_is_said(monkeypatch: pytest.Mon
     words = r"^worker 0 .*, 2 .* \(collector.timeout\); which of them the others wait for cannot be known$"
     with pytest.raises(WorkerError, match=words):
         silence.check()
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_to_all_processes_while_workers_start(number: signal.Signals):
+    received: list[int] = []
+    pid: list[int] = []
+    before = signal.signal(number, lambda *_: received.append(number))
+    blocked = signal.pthread_sigmask(signal.SIG_BLOCK, [])
+    expected = KeyboardInterrupt if number == signal.SIGINT else SystemExit
+    child = multiprocessing.get_context("fork").Process(target=time.sleep, args=(60,))
+
+    def start() -> None:
+        with started(None):
+            child.start()
+            pid.append(os.posix_spawnp("sleep", ["sleep", "60"], os.environ))  # in no list of multiprocessing
+            os.kill(child.pid or 0, number)
+            os.kill(os.getpid(), number)
+            assert not received
+            time.sleep(30)
+
+    try:
+        with pytest.raises(expected) as ended:
+            start()
+        assert getattr(ended.value, "code", 143) == 143
+        assert child.exitcode == -signal.SIGKILL  # not of the signal, which it had not begun to expect
+        assert not Path(f"/proc/{pid[0]}").exists()
+        assert received == [number]
+        assert signal.pthread_sigmask(signal.SIG_BLOCK, []) == blocked
+    finally:
+        signal.signal(number, before)
+
+
+def test_a_worker_that_has_begun_receives_signals():
+    def work() -> None:
+        time.sleep(1.2)  # the time until the first look at workers
+        begin_worker(False)
+        time.sleep(60)
+
+    child = multiprocessing.get_context("fork").Process(target=work)
+
+    def start() -> None:
+        with started(None):
+            child.start()
+            os.kill(child.pid or 0, signal.SIGTERM)
+            time.sleep(30)
+
+    with pytest.raises(WorkerError, match=r"process \d+\) was ended by SIGTERM"):
+        start()
+    assert child.exitcode == -signal.SIGTERM

@@ -30,7 +30,7 @@ from vusfa.errors import ConfigError, WorkerError
 from vusfa.objectives import TFRMSprop
 from vusfa.training.collectors import MakeEnv, make_collector, rows_per_worker
 from vusfa.training.trainer import Trainer
-from vusfa.training.workers import Silence, begin_worker, cannot_start, end_of
+from vusfa.training.workers import Silence, begin_worker, end_of, started
 
 __all__ = ["HogwildTrainer"]
 
@@ -127,20 +127,18 @@ class _Workers:
         self.procs: list[Any] = []
         self.reports: list[Any] = []
         try:
-            for rank in range(settings["collector"]["num_workers"]):
-                receiver, sender = context.Pipe(duplex=False)
-                make = partial(_make_single, trainer._make_env, settings, rank)
-                given = parts, make, settings, rank, self.frames, self.ended, sender
-                process = context.Process(target=_work, args=given, daemon=True)
-                process.start()
-                sender.close()  # the worker's alone: its end is then the end of its reports
-                self.procs.append(process)
-                self.reports.append(receiver)
-        except OSError as error:
-            self.patience = 0.0
-            self.close()
-            raise cannot_start(error) from error
+            with started(None if limit is None else max(limit, 120.0), may_end=True):
+                for rank in range(settings["collector"]["num_workers"]):
+                    receiver, sender = context.Pipe(duplex=False)
+                    make = partial(_make_single, trainer._make_env, settings, rank)
+                    given = parts, make, settings, rank, self.frames, self.ended, sender
+                    process = context.Process(target=_work, args=given, daemon=True)
+                    process.start()
+                    sender.close()  # the worker's alone: its end is then the end of its reports
+                    self.procs.append(process)
+                    self.reports.append(receiver)
         except BaseException:
+            self.patience = 0.0
             self.close()
             raise
         self.silence = Silence(self.procs, limit)

@@ -15,6 +15,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
+from multiprocessing import resource_tracker
 from types import FrameType
 from typing import Any
 
@@ -23,12 +24,14 @@ from torchrl.collectors import BaseCollector, MultiSyncCollector
 
 from vusfa.errors import VusfaError, WorkerError
 
-__all__ = ["Silence", "begin_worker", "cannot_start", "end_of", "started", "supervised", "watch"]
+__all__ = ["Silence", "begin_worker", "end_of", "started", "supervised", "watch"]
 
 #: What one wait, or one update between two waits, counts at most towards a time limit, in seconds: a
 #: training that was suspended (Ctrl-Z, a laptop's lid) does not hold that against its workers.
 LONGEST_WAIT = 10.0
 _PR_SET_PDEATHSIG = 1
+#: Signals that end a training.
+_ENDING = {signal.SIGINT, signal.SIGTERM, signal.SIGHUP}
 
 
 def begin_worker(autocast: bool) -> None:
@@ -39,6 +42,7 @@ def begin_worker(autocast: bool) -> None:
     """
     for number in (signal.SIGINT, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, _ENDING)  # see started()
     if sys.platform.startswith("linux"):
         with suppress(AttributeError, OSError):
             ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
@@ -53,8 +57,16 @@ def begin_worker(autocast: bool) -> None:
 
 
 @contextmanager
-def started(limit: float | None) -> Iterator[None]:
+def started(limit: float | None, *, may_end: bool = False) -> Iterator[None]:
     """Context in which workers start.
+
+    Signals that end a training wait meanwhile, those to workers until :func:`begin_worker`. Here they act
+    within a second. A worker that died of a signal to all processes before it has read what it is given would
+    leave this process writing to it for ever.
+
+    Args:
+        limit: seconds in which all must have started; None: any time.
+        may_end: whether a worker may have done its work before the last one has started.
 
     Raises:
         WorkerError: one dies, or all together take longer than ``limit`` seconds (None: any time), or the
@@ -66,28 +78,55 @@ def started(limit: float | None) -> Iterator[None]:
             resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))
     before, began = set(multiprocessing.active_children()), time.monotonic()
     seen: set[Any] = set()
+    alive = (None, 0) if may_end else (None,)
 
     def look(number: int, frame: FrameType | None) -> None:
+        _end_if_signaled()
         seen.update(child for child in multiprocessing.active_children() if child not in before)
-        dead = [end_of(child.pid, child.exitcode) for child in seen if child.exitcode is not None]
+        dead = [end_of(child.pid, child.exitcode) for child in seen if child.exitcode not in alive]
         if dead:
             raise WorkerError(dead[0])
         if limit is not None and time.monotonic() - began > limit:
             raise WorkerError(f"they have not begun within {limit:g} s (collector.timeout)")
 
+    resource_tracker.ensure_running()  # which ends by unblocking signals
+    others = _children()
+    blocked = signal.pthread_sigmask(signal.SIG_BLOCK, _ENDING)
     try:
         with _every_second(look):
             yield
-    except Exception as error:
+    except BaseException as error:
         for child in set(multiprocessing.active_children()) - before:
             child.kill()
             child.join()
-        if isinstance(error, VusfaError) and not isinstance(error, WorkerError):
+        for pid in _children() - others:  # one that was interrupted in its start is in no list
+            with suppress(ProcessLookupError, ChildProcessError):
+                os.kill(pid, signal.SIGKILL)
+                os.waitpid(pid, 0)
+        _end_if_signaled()  # TorchRL may have made something else of it
+        known = isinstance(error, VusfaError) and not isinstance(error, WorkerError)
+        if known or not isinstance(error, Exception):
             raise
-        raise cannot_start(error) from error
+        raise _cannot_start(error) from error
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, blocked)
 
 
-def cannot_start(error: Exception) -> WorkerError:
+def _children() -> set[int]:
+    """Processes that this thread has started; none where the system does not say."""
+    try:
+        with open(f"/proc/self/task/{threading.get_native_id()}/children", encoding="ascii") as file:
+            return {int(pid) for pid in file.read().split()}
+    except OSError:
+        return set()
+
+
+def _end_if_signaled() -> None:
+    for number in signal.sigpending() & _ENDING:
+        raise KeyboardInterrupt if number == signal.SIGINT else SystemExit(128 + number)
+
+
+def _cannot_start(error: Exception) -> WorkerError:
     """The error of workers that the system refuses to start, or that die at it."""
     reason = " ".join(str(error).split("\n")[0].split()) or type(error).__name__
     return WorkerError(
