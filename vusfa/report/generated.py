@@ -1,7 +1,7 @@
 """The tables that ``docs/*.md`` include: ``vusfa tables --docs docs/generated`` writes each to a file.
 
 :data:`TABLES` lists those of experiments that share their episodes; :func:`write_documents` adds the tables
-of ``vusfa transfer`` and ``vusfa generalise``.
+of ``vusfa transfer``, ``vusfa generalise`` and ``vusfa robustness``.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from vusfa.modules.config import MODELS
 from vusfa.report.experiment import Experiment, read_experiment
 from vusfa.report.markdown import markdown
 from vusfa.report.result_tables import comparison_rows, distance_rows, model_rows, run_rows
+from vusfa.report.robustness import robustness_table
 from vusfa.report.transfer_figure import transfer_tables
 from vusfa.report.unseen import unseen_table
 from vusfa.scenes import SceneSet
@@ -92,6 +93,7 @@ def documents(results: str | Path) -> dict[str, str]:
     lengths, differences = transfer_tables(read_runs(results, "transfer"), world)
     texts |= {"transfer.md": lengths, "transfer-differences.md": differences}
     texts["generalise.md"] = unseen_table(read_runs(results, "generalise"))
+    texts["robustness.md"] = robustness_table(read_runs(results, "robustness"))
     return {name: f"<!-- {COMMAND} -->\n\n{text}\n" for name, text in texts.items()}
 
 
