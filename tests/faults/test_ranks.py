@@ -6,6 +6,7 @@ import csv
 import os
 import signal
 import socket
+import time
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -15,7 +16,7 @@ import torch
 from endings import ended, logged_frames, start, wait_for
 
 from vusfa.modules.bottleneck import LatentSampler
-from vusfa.training import Trainer, distributed, load_checkpoint
+from vusfa.training import Trainer, distributed, load_checkpoint, rendezvous
 
 STEADY = ["optim.horizon=100000", "entropy.horizon=100000", "objective.normalize_advantage=true"]
 
@@ -119,6 +120,18 @@ def test_a_resumed_run_goes_on_number_for_number_or_with_the_rows_of_another_num
     for state in (three, load_checkpoint(tmp_path / "alone")):
         assert (state["updates"], state["collector"]["batch_size"]) == (4, [6])
         assert torch.equal(state["collector"]["carrier"]["goal_id"], half["collector"]["carrier"]["goal_id"])
+
+
+@pytest.mark.parametrize("late", [0, 1])
+def test_a_rank_that_begins_late_is_waited_for(tmp_path: Path, late: int):
+    """Longer than for an address that does not answer: where nobody listens yet, somebody will."""
+
+    def hook(rank: int) -> None:
+        rendezvous.REACH = 0.5
+        if rank == late:
+            time.sleep(2.0)
+
+    assert trained(tmp_path / "run", 2, "total_frames=24", hook=hook)["frames"] == 24
 
 
 @pytest.mark.parametrize(

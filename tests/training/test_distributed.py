@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import socket
 import threading
+import time
 from typing import Any
 
 import pytest
@@ -11,7 +13,7 @@ import torch
 from vusfa.algorithms.experience import merge_graphs
 from vusfa.errors import ConfigError, RankError
 from vusfa.objectives.returns import _normalize, _normalize_together
-from vusfa.training import StopOnSignal
+from vusfa.training import StopOnSignal, rendezvous
 from vusfa.training.ranks import Ranks, check_ranks, merged, settings_of_rank, share
 from vusfa.training.rendezvous import joined
 
@@ -73,7 +75,14 @@ def test_a_process_alone_is_alone(environ: dict[str, str]):
 
 @pytest.mark.parametrize(
     ("name", "text"),
-    [("RANK", "one"), ("WORLD_SIZE", "2.0"), ("MASTER_PORT", "http"), ("LOCAL_RANK", "-1"), ("RANK", "2")],
+    [
+        ("RANK", "one"),
+        ("WORLD_SIZE", "2.0"),
+        ("MASTER_PORT", "http"),
+        ("LOCAL_RANK", "-1"),
+        ("RANK", "2"),
+        ("MASTER_PORT", "0"),
+    ],
 )
 def test_variables_that_are_no_numbers_of_ranks(name: str, text: str):
     environ = {"RANK": "0", "WORLD_SIZE": "2", "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": "1", name: text}
@@ -82,6 +91,26 @@ def test_variables_that_are_no_numbers_of_ranks(name: str, text: str):
         joined(settings(), environ),
     ):
         pass
+
+
+@pytest.mark.parametrize(
+    ("host", "reason"), [("nowhere.invalid", "(Name|name|address)"), ("127.0.0.1", "Connection refused")]
+)
+def test_an_address_that_does_not_answer_is_an_error_soon(
+    host: str, reason: str, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr(rendezvous, "REACH", 0.3)
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    environ = {"RANK": "1", "WORLD_SIZE": "2", "MASTER_ADDR": host, "MASTER_PORT": str(port)}
+    began = time.monotonic()
+    with (
+        pytest.raises(RankError, match=f"rank 1 of 2 does not find the others at {host}:{port} .*{reason}"),
+        joined(settings(collector={"timeout": 0.6}), environ),
+    ):
+        pass
+    assert time.monotonic() - began < 10.0
 
 
 def part(first: int, episodes: float) -> dict[str, Any]:

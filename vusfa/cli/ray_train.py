@@ -9,10 +9,11 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from vusfa.cluster.locks import FileLock
+from vusfa.cluster.locks import FileLock, LockedError
 from vusfa.cluster.ray_workers import connected
 from vusfa.errors import ConfigError, VusfaError, WorkerError
 from vusfa.experiments.training import train
@@ -58,6 +59,7 @@ def train_on_ray(settings: Mapping[str, Any], overrides: Sequence[str] = (), dra
         from ray.train.torch import TorchTrainer
 
         RunFolder(folder, plain)  # refused now rather than by every worker
+        _check_free(folder)
         make_trainer(plain, overrides)
         resources = {"CPU": 1.0, **chosen["resources"]}
         begun = {"settings": plain, "overrides": list(overrides), "draw": draw, "cwd": os.getcwd()}
@@ -99,15 +101,26 @@ def _stamp(folder: Path) -> int | None:
     return path.stat().st_mtime_ns if path.is_file() else None
 
 
+def _check_free(folder: Path) -> None:
+    """Workers wait for those of this job that were there before; another job is none of these."""
+    try:
+        with suppress(FileNotFoundError), FileLock(folder / ".lock"):
+            pass
+    except LockedError as error:
+        raise ConfigError(
+            f"folder is '{folder}', where {error.owner} is writing a run; wait for it, or give another folder"
+        ) from error
+
+
 def _learn(begun: Mapping[str, Any]) -> None:
     """A worker's training; one that Ray has restarted goes on from the last checkpoint."""
     os.chdir(begun["cwd"])
     settings = dict(begun["settings"])
     folder = Path(settings["folder"])
-    if _stamp(folder) != begun["checkpoint"]:
+    with FileLock(folder / ".lock", wait=True):  # until a worker that wrote there before has ended
+        found = _stamp(folder)  # hence the same for all workers
+    if found not in (None, begun["checkpoint"]):
         settings["resume"] = str(folder / CHECKPOINT)
-        with FileLock(folder / ".lock", wait=True):  # until the worker that wrote it has ended
-            pass
     train(settings, begun["overrides"], begun["draw"])
 
 

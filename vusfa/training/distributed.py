@@ -27,6 +27,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from datetime import timedelta
 from pathlib import Path
+from types import FrameType
 from typing import Any
 
 import numpy as np
@@ -151,8 +152,9 @@ class ProcessRanks(Ranks):
             looked, beat = time.monotonic(), self._store.get(f"beat{other}")
             if beat != before:
                 before, since = beat, looked
-            if looked - since > self._limit or self._store.check([f"left{other}"]):
-                raise RuntimeError(f"rank {other} does not answer")
+            has_left = self._store.check([f"left{other}"])
+            if looked - since > (MISSED if has_left else self._limit):
+                raise RuntimeError(f"rank {other} {'has left' if has_left else 'does not answer'}")
         work.wait()
 
     @contextmanager
@@ -186,6 +188,19 @@ class ProcessRanks(Ranks):
         restore(path, "ranks", lambda _: found.update(share(state, self.rank, self.size, algorithm)), state)
         return found
 
+    @contextmanager
+    def terminable(self) -> Iterator[None]:
+        """Context in which SIGTERM, which a launcher sends to the others when a rank has ended, is the error
+        that names this rank."""
+        if threading.current_thread() is not threading.main_thread():  # only that one may set handlers
+            yield
+            return
+        before = signal.signal(signal.SIGTERM, self._terminated)
+        try:
+            yield
+        finally:
+            signal.signal(signal.SIGTERM, before or signal.SIG_DFL)
+
     def leave(self, reason: str) -> None:
         """End the signs of life; the reason is empty where another rank has ended before, or all is done."""
         self._left.set()
@@ -203,11 +218,17 @@ class ProcessRanks(Ranks):
         try:
             yield
         except RuntimeError as error:
-            self._is_broken = True
-            raise self._lost(error) from error
+            reason = str(error).splitlines()[0]
+            raise self._lost(f"the connection between the ranks broke ({reason})") from error
 
-    def _lost(self, error: RuntimeError) -> RankError:
-        """The error of a connection that broke: which rank is gone. The first that is left reports it."""
+    def _terminated(self, number: int, frame: FrameType | None) -> None:
+        signal.signal(number, signal.SIG_DFL)
+        raise self._lost(f"rank {self.rank} was ended by SIGTERM")
+
+    def _lost(self, what: str) -> RankError:
+        """The error that names the rank that is gone, or says what happened where none is. The first rank
+        that is left reports it."""
+        self._is_broken = True
         try:
             before = self._signs("beat")
             time.sleep(MISSED)
@@ -218,7 +239,6 @@ class ProcessRanks(Ranks):
         ended = [rank for rank in others if left.get(rank)]
         dead = [rank for rank in others if rank not in left and beats[rank] == before[rank]]
         late = [rank for rank in others if int(beats[rank].split()[1]) < self._steps and rank not in left]
-        what = f"the connection between the ranks broke ({str(error).splitlines()[0]})"
         if ended:
             what = f"{who[ended[0]]} has ended: {left[ended[0]]}"
         elif dead:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+import socket
+import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from datetime import timedelta
@@ -20,8 +22,9 @@ __all__ = ["joined"]
 
 #: Variables that a launcher sets, such as torchrun or Ray Train.
 VARIABLES = ("RANK", "WORLD_SIZE", "MASTER_ADDR", "MASTER_PORT")
-#: Seconds for all ranks to find each other.
-START = 120.0
+#: Seconds to reach the address where the ranks meet. Who does not listen there yet may be late, and gets
+#: ``collector.timeout`` seconds, as all ranks get.
+REACH = 15.0
 
 
 @contextmanager
@@ -33,7 +36,8 @@ def joined(settings: Mapping[str, Any], environ: Mapping[str, str] = os.environ)
     Args:
         settings: of the training, the same on all ranks.
         environ: with :data:`VARIABLES`, and ``LOCAL_RANK``, the GPU's number where ``device=cuda``; where
-            they are missing, this process is alone.
+            they are missing, this process is alone. ``TORCHELASTIC_USE_AGENT_STORE`` is True where torchrun
+            listens at the address, rather than rank 0.
 
     Raises:
         ConfigError: settings that ranks cannot share (on rank 0; a RankError on the others), or variables
@@ -53,6 +57,8 @@ def joined(settings: Mapping[str, Any], environ: Mapping[str, str] = os.environ)
     if size < 2:
         yield Ranks()
         return
+    if not 0 < int(numbers["MASTER_PORT"]) < 1 << 16:
+        raise ConfigError(f"the environment's MASTER_PORT is {numbers['MASTER_PORT']}; give 1 to 65535")
     try:
         check_ranks(settings, size)
     except VusfaError as error:  # all ranks find the same
@@ -63,14 +69,20 @@ def joined(settings: Mapping[str, Any], environ: Mapping[str, str] = os.environ)
     limit, found = settings["collector"].get("timeout") or NEVER, distributed.is_initialized()
     try:
         if not found:
-            backend, wait = "cpu:gloo,cuda:nccl" if cuda else "gloo", timedelta(seconds=START)
-            distributed.init_process_group(backend, rank=rank, world_size=size, timeout=wait)
+            own = rank == 0 and environ.get("TORCHELASTIC_USE_AGENT_STORE") != "True"
+            store = _store(environ["MASTER_ADDR"], int(numbers["MASTER_PORT"]), own, limit)
+            backend, wait = "cpu:gloo,cuda:nccl" if cuda else "gloo", timedelta(seconds=limit)
+            distributed.init_process_group(backend, store=store, rank=rank, world_size=size, timeout=wait)
         ranks = ProcessRanks(rank, size, limit, cuda)
-    except (RuntimeError, ValueError) as error:
+    except (RuntimeError, ValueError, OSError) as error:
         where, reason = f"{environ['MASTER_ADDR']}:{environ['MASTER_PORT']}", str(error).split("\n")[0]
-        raise RankError(f"rank {rank} of {size} does not find the others at {where} ({reason})") from error
+        raise RankError(
+            f"rank {rank} of {size} does not find the others at {where} ({reason}); MASTER_ADDR and"
+            " MASTER_PORT must lead to rank 0, or to torchrun where it began"
+        ) from error
     try:
-        yield ranks
+        with ranks.terminable():
+            yield ranks
         ranks.leave("")
     except BaseException as error:
         ranks.leave("" if isinstance(error, RankError) else str(error) or type(error).__name__)
@@ -79,3 +91,31 @@ def joined(settings: Mapping[str, Any], environ: Mapping[str, str] = os.environ)
         if not found:
             with suppress(RuntimeError):  # of connections that are broken
                 distributed.destroy_process_group()
+
+
+def _store(host: str, port: int, is_own: bool, patience: float) -> distributed.Store:
+    """The store at an address, begun by the one process that it is the own of.
+
+    Raises:
+        OSError, RuntimeError: nobody answers, for :data:`REACH` seconds; or nobody listens there, for
+            ``patience`` seconds.
+    """
+    began = time.monotonic()
+    while True:
+        try:
+            if is_own:
+                socket.getaddrinfo(host, port)
+            else:
+                socket.create_connection((host, port), timeout=REACH).close()
+            break
+        except OSError as error:
+            is_late = isinstance(error, ConnectionRefusedError)
+            if time.monotonic() - began > (patience if is_late else min(REACH, patience)):
+                raise
+        time.sleep(0.1)
+    wait = timedelta(seconds=REACH)
+    store = distributed.TCPStore(
+        host, port, is_master=is_own, timeout=wait, wait_for_workers=False, multi_tenant=True
+    )
+    store.set_timeout(timedelta(seconds=patience))
+    return store
