@@ -54,7 +54,7 @@ test: lint typecheck $(RENDER)  ## lint, type-check, all tests and doctests
 	$(BIN)/python -m pytest -n 2 --dist worksteal -q
 
 faults: $(STAMP)  ## the long form of the suites of faults, half an hour; writes docs/reliability.md
-	VUSFA_LONG=1 $(BIN)/python -m pytest -q tests/cluster/test_ray_train.py
+	VUSFA_LONG=1 $(BIN)/python -m pytest -q tests/cluster/test_ray_train.py tests/faults/test_torchrun.py
 	$(BIN)/python tests/faults/long.py $(FAULTS)
 
 clean:  ## remove the virtual environment and everything built
