@@ -46,7 +46,7 @@ def bounded(text: str) -> str:
     """Text whose words of more than 1,000 characters, a value of a command line, are cut.
 
     >>> len(bounded(f"folder is '{'x' * 100_000}'; give another"))
-    541
+    526
     """
     return _LONG.sub(lambda match: f"{match[0][:400]}...{match[0][-100:]}", text)
 

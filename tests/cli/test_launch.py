@@ -177,15 +177,31 @@ def test_resume_auto(run, checkpoint, settings_of):
     assert run("resume=auto")[1].startswith("error: resume=auto looks into the run's folder; give folder=")
 
 
-@pytest.mark.parametrize("name", ["lr=1,2 (b)", "it's", "[a]{b}:c", "a\\'b"])
+@pytest.mark.parametrize(
+    "name",
+    ["lr=1,2 (b)", "it's", "[a]{b}:c", "a\\'b", "naïve-日本 😀", "a;b&c", "~a*b#c", 'say"hi"', "a,b"],
+)
 def test_a_run_in_any_folder_can_be_resumed(checkpoint, settings_of, name: str):
     path = checkpoint("seed=3")
     odd = path.parent.with_name(name)
     path.parent.rename(odd)
     settings = settings_of(f"resume={odd / 'checkpoint.pt'}")
     assert (settings["folder"], settings["seed"]) == (str(odd), 3)
-    if "," not in name:
-        assert settings_of(f"folder={odd}")["folder"] == str(odd)
+    assert settings_of(f"folder={odd}")["folder"] == str(odd)
+
+
+@pytest.mark.parametrize("line", ["scenes=küche.h5", "scenes=[bathroom,räume/a.h5]", "logger.name=prüfung"])
+def test_names_that_are_not_ascii_are_read(settings_of, line: str):
+    name, _, value = line.partition("=")
+    found = settings_of(line)
+    assert (found["logger"]["name"] if "." in name else found[name]) in (value, value.strip("[]").split(","))
+
+
+def test_a_sweep_may_be_asked_for_anywhere_on_the_command_line(run):
+    seeds = []
+    words = ["optim=adam", "--multirun", "hydra.sweep.dir=../sweep", "seed=1,2"]
+    assert run(*words, job=lambda settings, _: seeds.append(settings["seed"]) or 0) == (0, "")
+    assert seeds == [1, 2]
 
 
 def test_compose_is_what_the_command_line_would_be():
@@ -282,3 +298,9 @@ def test_settings_without_a_checkpoint_file(run):
         2,
         "error: none.pt: no such checkpoint; vusfa train writes RUN/checkpoint.pt\n",
     )
+
+
+def test_a_name_that_the_locale_cannot_read_is_one_line(run):
+    code, text = run("folder=caf\udce9")
+    assert (code, text.count("\n")) == (2, 1)
+    assert "caf\\udce9'\" is no text in this locale; set PYTHONUTF8=1, or rename it" in text

@@ -158,6 +158,12 @@ class Process:
     pid = 1  # which no signal stops
 
 
+def let_pass(seconds: float, now: list[float], silence: Silence) -> None:
+    for _ in range(round(2 * seconds)):
+        now[0] += 0.5
+        silence.check()
+
+
 def test_of_workers_that_wait_for_each_other_the_silent_one_is_named(monkeypatch: pytest.MonkeyPatch):
     now = [0.0]
     monkeypatch.setattr("vusfa.training.workers.time.monotonic", lambda: now[0])
@@ -165,24 +171,32 @@ def test_of_workers_that_wait_for_each_other_the_silent_one_is_named(monkeypatch
     for index in (0, 1, 2, 0, 2):  # a round, and of the next all but 1
         silence.ends(index)
         silence.check()
-    now[0] = 6.0
-    with pytest.raises(
-        WorkerError, match=r"^worker 1 \(process 1\) of the collector has sent nothing for 5 s"
-    ):
-        silence.check()
+    words = r"^worker 1 \(process 1\) of the collector has sent nothing for 5 s"
+    with pytest.raises(WorkerError, match=words):
+        let_pass(6.0, now, silence)
 
 
 def test_where_the_silent_one_cannot_be_known_it_is_said(monkeypatch: pytest.MonkeyPatch):
     now = [0.0]
     monkeypatch.setattr("vusfa.training.workers.time.monotonic", lambda: now[0])
     silence = Silence([Process(), Process(), Process()], 5.0)
-    now[0] = 4.0
+    let_pass(4.0, now, silence)
     silence.ends(1)
-    silence.check()
-    now[0] = 6.0
     words = r"^worker 0 .*, 2 .* \(collector.timeout\); which of them the others wait for cannot be known$"
     with pytest.raises(WorkerError, match=words):
-        silence.check()
+        let_pass(2.0, now, silence)
+
+
+def test_a_suspended_training_with_a_short_limit_does_not_accuse_its_workers(monkeypatch: pytest.MonkeyPatch):
+    """Of Ctrl-Z and what follows, as much as a quarter of the limit counts."""
+    now = [0.0]
+    monkeypatch.setattr("vusfa.training.workers.time.monotonic", lambda: now[0])
+    silence = Silence([Process(), Process()], 5.0)
+    now[0] = 3600.0
+    silence.check()
+    let_pass(3.0, now, silence)
+    with pytest.raises(WorkerError, match="has sent nothing"):
+        let_pass(1.0, now, silence)
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])

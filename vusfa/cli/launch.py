@@ -41,8 +41,9 @@ from vusfa.conf.schema import (
     validated,
     wrong_value,
 )
-from vusfa.errors import RankError, ResultError, VusfaError, WorkerError, near
+from vusfa.errors import ConfigError, RankError, ResultError, VusfaError, WorkerError, near
 from vusfa.files import say, use_own_temporary_folder
+from vusfa.limits import brief
 from vusfa.modules.config import resolve_config
 from vusfa.training.folder import AUTO, found_checkpoint
 
@@ -70,7 +71,10 @@ def launch(job: Job, folder: Path = FOLDER, name: str = "train") -> None:
     if "RL_LOGGING_LEVEL" not in os.environ:  # enables TorchRL's log
         logging.getLogger("torchrl").setLevel(logging.WARNING)
     use_own_temporary_folder()
-    sys.argv[1:] = [conf_compose.appended(_quoted(argument)) for argument in sys.argv[1:]]
+    multirun = [word for word in sys.argv[1:] if word in ("--multirun", "-m")]
+    others = [word for word in sys.argv[1:] if word not in multirun]
+    others = [conf_compose.appended(_quoted(word, sweeps=bool(multirun))) for word in others]
+    sys.argv[1:] = [*multirun, *others]  # argparse refuses the option among the settings
     codes: list[int] = []
 
     def guarded(cfg: DictConfig) -> None:
@@ -82,6 +86,9 @@ def launch(job: Job, folder: Path = FOLDER, name: str = "train") -> None:
             raise _Stopped
 
     def run() -> int:
+        for word in sys.argv[1:]:
+            if not word.isprintable() and re.search("[\ud800-\udfff]", word):
+                raise ConfigError(f"{brief(word)} is no text in this locale; set PYTHONUTF8=1, or rename it")
         register_schema()
         with suppress(_Stopped):
             hydra.main(version_base="1.3", config_path=str(folder.resolve()), config_name=name)(guarded)()
@@ -154,18 +161,35 @@ def _settled(cfg: DictConfig, overrides: Sequence[str]) -> dict[str, Any]:
     return resumed_settings(settings, overrides) if settings["resume"] else settings
 
 
-def _quoted(argument: str) -> str:
-    """Quote a path with characters that Hydra would interpret (``=``, ``,``, ``(``).
+def _quoted(argument: str, sweeps: bool = False) -> str:
+    """Quote a path with characters that Hydra would interpret (``=``, ``,``, ``(``), and text that it cannot
+    read, which is all but ASCII.
+
+    Args:
+        argument: a word of the command line.
+        sweeps: a comma in the name of the folder separates runs.
 
     >>> _quoted("resume=runs/lr=1,2/checkpoint.pt"), _quoted("resume=auto"), _quoted("seed=1,2")
     ("resume='runs/lr=1,2/checkpoint.pt'", 'resume=auto', 'seed=1,2')
+    >>> _quoted("folder=a,b"), _quoted("folder=a,b", sweeps=True), _quoted("scenes=[bathroom,küche.h5]")
+    ("folder='a,b'", 'folder=a,b', "scenes=[bathroom,'küche.h5']")
     """
     name, _, value = argument.partition("=")
-    odd = re.search(r"[=,()\[\]{}:\s'\"\\]", value) and value[:1] not in "'\"" and "${" not in value
-    if not odd or name not in ("resume", "folder") or (name == "folder" and "," in value):
+    if value[:1] in ("'", '"') or "${" in value or (name == "folder" and "," in value and sweeps):
         return argument
+    if name in ("resume", "folder"):
+        return f"{name}={_as_text(value)}" if re.search(r"[^\w./~@%+*$-]", value, re.ASCII) else argument
+    if value.isascii() or re.search(r"['\"{}()]|\[.*\[", value):
+        return argument
+    if value[:1] == "[" and value[-1:] == "]":
+        parts = [part.strip() for part in value[1:-1].split(",")]
+        return f"{name}=[{','.join(part if part.isascii() else _as_text(part) for part in parts)}]"
+    return f"{name}={_as_text(value)}"
+
+
+def _as_text(value: str) -> str:
     escaped = re.sub(r"(\\*)'", lambda found: found[1] * 2 + "\\'", value)
-    return f"{name}='{escaped}'"
+    return f"'{escaped}'"
 
 
 def _report(job: Callable[[], int], folder: Path) -> int:

@@ -26,8 +26,9 @@ from vusfa.errors import VusfaError, WorkerError
 
 __all__ = ["Silence", "begin_worker", "end_of", "started", "supervised", "watch"]
 
-#: What one wait, or one update between two waits, counts at most towards a time limit, in seconds: a
-#: training that was suspended (Ctrl-Z, a laptop's lid) does not hold that against its workers.
+#: What one wait, or one update between two waits, counts at most towards a time limit, in seconds; a quarter
+#: of the limit is the other bound: a training that was suspended (Ctrl-Z, a laptop's lid) does not hold that
+#: against its workers.
 LONGEST_WAIT = 10.0
 _PR_SET_PDEATHSIG = 1
 #: Signals that end a training.
@@ -203,7 +204,7 @@ class Silence:
         """Raise a WorkerError that names the workers which have been silent for too long: of these the one
         that a signal has stopped, where there is one, for others may only wait for its lock."""
         now = time.monotonic()
-        self._clock += min(now - self._last, LONGEST_WAIT)
+        self._clock += min(now - self._last, LONGEST_WAIT, (self._limit or math.inf) / 4)
         self._last = now
         silent = [i for i, heard in enumerate(self._heard) if self._clock - heard > (self._limit or math.inf)]
         silent = [i for i in silent if i not in self._sent or len(self._sent) == len(self._workers)]

@@ -83,6 +83,9 @@ camera: wide
         ("- 1", "the plan: must be a mapping"),
         ("name: a\nsize: [3, 3, 2.6]\ngrid: {step: .nan}", "grid.step"),
         ("name: a\nsize: [3, 3, 2.6]\nseed: .inf", "must be a whole number"),
+        ("name: a\nsize: [3, 3, 2.6]\nseed: 1" + 30 * "0", "must be a whole number below"),
+        ('name: "a\\e[2J"\nsize: [3, 3, 2.6]', "must be text of one line"),
+        ("name: a\nkind: " + 999 * "x" + "\nsize: [3, 3, 2.6]", "at most 200 characters"),
         ("name: a\nsize: [3, .inf, 2.6]", "finite"),
     ],
 )

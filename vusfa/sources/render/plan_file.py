@@ -13,7 +13,7 @@ from typing import Any, TypeVar, Union, cast, get_args, get_origin, get_type_hin
 import yaml
 
 from vusfa.errors import SceneError
-from vusfa.limits import MAX_FURNITURE, brief
+from vusfa.limits import MAX_FURNITURE, MAX_NAME, brief
 from vusfa.reading import parse_yaml, read_text
 from vusfa.sources.render.faults import plan_faults
 from vusfa.sources.render.plan import Plan
@@ -97,8 +97,8 @@ def _build(kind: Any, value: Any, where: str, faults: list[str]) -> Any:
         )
     fits = {
         float: _is_number,
-        int: lambda item: _is_number(item) and item == int(item),
-        str: lambda item: isinstance(item, str),
+        int: lambda item: _is_number(item) and item == int(item) and abs(item) < 2**63,
+        str: lambda item: isinstance(item, str) and item.isprintable() and len(item) <= MAX_NAME,
         bool: lambda item: isinstance(item, bool),
     }[kind]
     try:
@@ -106,7 +106,8 @@ def _build(kind: Any, value: Any, where: str, faults: list[str]) -> Any:
             return kind(value)
     except (OverflowError, ValueError):  # infinity and NaN are no whole numbers
         pass
-    names = {float: "a number", int: "a whole number", str: "text", bool: "true or false"}
+    names = {float: "a number", int: "a whole number below 2 ** 63", bool: "true or false"}
+    names[str] = f"text of one line, at most {MAX_NAME} characters"
     faults.append(f"{where}: {brief(value)} must be {names[kind]}")
     return None
 
