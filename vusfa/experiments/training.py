@@ -179,7 +179,8 @@ def _evaluation(trainer: Trainer) -> dict[str, Any]:
 
 def _evaluate(trainer: Trainer, checkpoint: Path) -> Comparison | None:
     """The evaluation at the end, shared out among ranks; on rank 0."""
-    name, scenes, ranks = row_name(trainer.settings), trainer.scenes, trainer.ranks
+    name, ranks = row_name(trainer.settings), trainer.ranks
+    scenes = trainer.scenes.to(next(trainer.agent.parameters()).device)
     chosen = _evaluation(trainer)
     goals = chosen.pop("goals")
     parts = parts_of(scenes, resolve_goals(scenes, goals), chosen["episodes_per_goal"])
@@ -203,7 +204,8 @@ def _evaluate(trainer: Trainer, checkpoint: Path) -> Comparison | None:
     if not ranks.is_first:
         return None
     chosen |= {"history": trainer.agent.config["history"]}
-    return compare({name: Episodes.joined(tables)}, scenes, goals, trained=trainer.goals, **chosen)
+    walked = Episodes.joined(tables)
+    return compare({name: walked}, trainer.scenes, goals, trained=trainer.goals, **chosen)
 
 
 def _plain(value: Any) -> Any:
