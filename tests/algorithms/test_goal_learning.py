@@ -12,7 +12,7 @@ from omegaconf import OmegaConf
 from tensordict import TensorDict
 from torch import Tensor
 
-from vusfa.algorithms.goal_learning import SceneSample
+from vusfa.algorithms.goal_learning import GoalLearning, SceneSample, slow_copy
 from vusfa.algorithms.hindsight_goals import drawn_steps
 from vusfa.cli.launch import compose
 from vusfa.errors import CheckpointError, ConfigError
@@ -21,7 +21,7 @@ from vusfa.training import Trainer, make_trainer
 SMALL = ["agent.hidden_size=64", "agent.embedding_size=64", "autocast=false", "optim.lr=3.0e-3"]
 SMALL += ["collector.num_envs=16", "algorithm.batch_size=512", "algorithm.policy_pairs=256"]
 SMALL += ["algorithm.hidden_size=64", "algorithm.embedding_size=16", "env.goals=[3,9,12]"]
-NAMES = ["contrastive"]
+NAMES = ["contrastive", "implicit_q", "forward_backward"]
 
 
 def trainer(scene_file: Path, name: str, *overrides: str) -> Trainer:
@@ -45,10 +45,9 @@ def share_of_best(one: Trainer) -> float:
     return best[state != goal].float().mean().item()
 
 
-@pytest.mark.parametrize("name", NAMES)
-def test_it_learns_the_way_to_goals_that_are_never_rewarded(scene_file: Path, name: str) -> None:
+def test_it_learns_the_way_to_goals_that_are_never_rewarded(scene_file: Path) -> None:
     torch.manual_seed(0)
-    one = trainer(scene_file, name, "total_frames=8000")
+    one = trainer(scene_file, "contrastive", "total_frames=8000")
     assert share_of_best(one) < 0.7
     asked: set[int] = set()
     with one.collecting() as batches:
@@ -56,6 +55,40 @@ def test_it_learns_the_way_to_goals_that_are_never_rewarded(scene_file: Path, na
             asked |= set(one.update(batches)[0]["goal_id"].flatten().tolist())
     assert asked == {3, 9, 12}
     assert share_of_best(one) > 0.9
+
+
+def walks_on_a_ring(size: int, rows: int, discount: float) -> SceneSample:
+    """Steps of random walks on a ring, forward, backward or on the spot, and where each was k steps on."""
+    move = torch.tensor([1, -1, 0, 0])
+    state, action = torch.randint(size, (rows,)), torch.randint(4, (rows,))
+    following = (state + move[action]) % size
+    steps = drawn_steps(torch.full((rows,), 20), discount)
+    further = (move[torch.randint(4, (rows, 20))] * (torch.arange(20) < steps.unsqueeze(1) - 1)).sum(1)
+    goal = (following + further) % size
+    return SceneSample(0, torch.arange(size), state, action, following, goal, steps)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_critic_learns_the_shorter_way_around_a_ring(scene_file: Path, name: str) -> None:
+    """Of all 72 pairs of its states, from steps and walks at random."""
+    torch.manual_seed(0)
+    size, algorithm = 9, trainer(scene_file, name).algorithm
+    assert isinstance(algorithm, GoalLearning)
+    features = torch.eye(size)
+    algorithm.critic = critic = algorithm.make_critic(size, 4)
+    if hasattr(algorithm, "slow"):
+        algorithm.slow = slow_copy(critic, 0.1)
+    optimizer = torch.optim.Adam(critic.parameters(), lr=2e-3)
+    for _ in range(300):
+        if hasattr(algorithm, "slow"):
+            algorithm.slow.update_parameters(critic)
+        terms, scores = algorithm.critic_terms(walks_on_a_ring(size, 512, 0.9), features)
+        optimizer.zero_grad()
+        torch.stack(list(terms.values())).sum().backward()
+        optimizer.step()
+    state, away = torch.arange(size).repeat(size - 1), torch.arange(1, size).repeat_interleave(size)
+    chosen = scores(state, (state + away) % size).argmax(-1)
+    assert (chosen == torch.where(away <= size // 2, 0, 1)).float().mean() > 0.95
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -122,6 +155,9 @@ def test_weights_of_another_algorithm_are_refused(scene_file: Path) -> None:
             "collector.kind=multi_async",
             "collector.kind=multi_async hands over",
         ),
+        ("implicit_q", "algorithm.expectile=1.0", "algorithm.expectile is 1.0; give a number"),
+        ("implicit_q", "algorithm.step_cost=0.0", "algorithm.step_cost is 0.0; give a number above 0"),
+        ("forward_backward", "algorithm.goal_share=2.0", "goal_share 2.0; give numbers between 0 and 1"),
     ],
 )
 def test_settings_that_make_no_sense_are_refused(

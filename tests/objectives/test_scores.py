@@ -13,6 +13,7 @@ from torch.distributions import Categorical, Normal
 from vusfa.objectives import ScoreLoss
 from vusfa.objectives.goal_critics import (
     implicit_q_loss,
+    implied_reward,
     info_nce_loss,
     measure_loss,
     orthonormality_loss,
@@ -148,3 +149,12 @@ def test_orthonormality_loss_is_the_distance_of_the_second_moment() -> None:
     moment = sum(d * torch.outer(b, b) for d, b in zip(density, back, strict=True))
     expected = (moment - torch.eye(2)).square().sum() - 2
     torch.testing.assert_close(orthonormality_loss(back, density), expected)
+
+
+def test_a_reward_is_implied_by_the_task_that_it_gives() -> None:
+    """z = E[r B] of any reward that is linear in B gives that reward back."""
+    back = torch.randn(5, 2, generator=torch.Generator().manual_seed(0))
+    density, reward = torch.tensor([0.1, 0.2, 0.3, 0.2, 0.2]), back @ torch.tensor([2.0, -1.0])
+    task = (density * reward) @ back
+    found = implied_reward(back, density, task.expand(5, -1), torch.arange(5))
+    torch.testing.assert_close(found, reward, atol=0.02, rtol=0)

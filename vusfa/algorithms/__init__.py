@@ -1,16 +1,18 @@
 """Algorithms: the losses of a batch, of replay, and what follows a step; a registry of them.
 
 >>> sorted(ALGORITHMS)
-['autoencoder', 'contrastive', 'hindsight', 'replay_search', 'usf']
+['autoencoder', 'contrastive', 'forward_backward', 'hindsight', 'implicit_q', 'replay_search', 'usf']
 """
 
 from vusfa.algorithms.autoencoder import Autoencoder
 from vusfa.algorithms.base import Algorithm, AlgorithmSettings
 from vusfa.algorithms.contrastive import Contrastive
 from vusfa.algorithms.experience import ExperienceGraph
+from vusfa.algorithms.forward_backward import ForwardBackward
 from vusfa.algorithms.goal_learning import GoalLearning, GoalLearningSettings
 from vusfa.algorithms.hindsight import Hindsight
 from vusfa.algorithms.hindsight_goals import HindsightSampler
+from vusfa.algorithms.implicit_q import ImplicitQ
 from vusfa.algorithms.registry import (
     ALGORITHMS,
     LOSS_TERMS,
@@ -33,11 +35,13 @@ __all__ = [
     "Autoencoder",
     "Contrastive",
     "ExperienceGraph",
+    "ForwardBackward",
     "GoalLearning",
     "GoalLearningSettings",
     "Hindsight",
     "HindsightReplay",
     "HindsightSampler",
+    "ImplicitQ",
     "ReplaySearch",
     "annealed",
     "make_algorithm",

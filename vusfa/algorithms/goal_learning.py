@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
+from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
 from vusfa.algorithms.base import Algorithm, AlgorithmSettings, check_replay
 from vusfa.algorithms.registry import ALGORITHMS
@@ -18,7 +19,7 @@ from vusfa.modules import Agent
 from vusfa.objectives.scores import ScoreLoss
 from vusfa.scenes import SceneSet
 
-__all__ = ["GoalLearning", "GoalLearningSettings", "SceneSample", "Scores", "scores_of"]
+__all__ = ["GoalLearning", "GoalLearningSettings", "SceneSample", "Scores", "scores_of", "slow_copy"]
 
 #: Frames of walking before the first step, at most, where settings give none.
 MAX_START = 100_000
@@ -92,14 +93,6 @@ class SceneSample(NamedTuple):
         parts = (part[row] for part in self[2:])
         return SceneSample(self.scene, self.states, *parts)
 
-    def distinct(self, num_actions: int) -> tuple[Tensor, Tensor, Tensor]:
-        """Distinct pairs of state and action, as state * A + action, the state that followed each (the last
-        one, of several), and how often each occurs; (R,)."""
-        row, place, often = (self.state * num_actions + self.action).unique(
-            return_inverse=True, return_counts=True
-        )
-        return row, torch.empty_like(row).scatter_(0, place, self.following), often
-
     def counts(self, num_actions: int) -> Tensor:
         """How often each state with an action has each goal, (S * A, S), float32."""
         size = len(self.states)
@@ -115,6 +108,21 @@ def scores_of(table: Tensor) -> Scores:
     """
     constant = table.detach()
     return lambda state, goal: constant[state, :, goal]
+
+
+def slow_copy(critic: nn.Module, rate: float) -> AveragedModel:
+    """A copy whose ``update_parameters(critic)`` moves its weights by a share ``rate`` of the way to the
+    critic's.
+
+    >>> layer = nn.Linear(1, 1, bias=False)
+    >>> slow = slow_copy(layer, 0.25)
+    >>> for value in (0.0, 1.0):
+    ...     _ = nn.init.constant_(layer.weight, value)
+    ...     slow.update_parameters(layer)
+    >>> slow.module.weight.item()
+    0.25
+    """
+    return AveragedModel(critic, multi_avg_fn=get_ema_multi_avg_fn(1 - rate))
 
 
 class GoalLearning(Algorithm):

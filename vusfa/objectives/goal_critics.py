@@ -6,11 +6,12 @@ computed once, and a matrix of counts says how often it was asked.
 
 from __future__ import annotations
 
+import torch
 from torch import Tensor
 
 from vusfa.objectives.hindsight import expectile_loss
 
-__all__ = ["implicit_q_loss", "info_nce_loss", "measure_loss", "orthonormality_loss"]
+__all__ = ["implicit_q_loss", "implied_reward", "info_nce_loss", "measure_loss", "orthonormality_loss"]
 
 
 def info_nce_loss(scores: Tensor, count: Tensor, penalty: float = 0.0) -> Tensor:
@@ -116,3 +117,23 @@ def orthonormality_loss(backward: Tensor, density: Tensor) -> Tensor:
     """
     moment = (backward * density.unsqueeze(-1)).mT @ backward
     return moment.square().sum() - 2 * (density * backward.square().sum(-1)).sum()
+
+
+def implied_reward(backward: Tensor, density: Tensor, task: Tensor, state: Tensor) -> Tensor:
+    r"""The reward of a task in states, B(s) . (E[B B^T] + 0.001 I)^-1 z, (n,): of the directions of B, the
+    combination that z is the expectation of.
+
+    Args:
+        backward: B, (S, d).
+        density: rho, (S,), which sums to 1.
+        task: z, (n, d).
+        state: (n,) int64.
+
+    >>> import torch
+    >>> back = 2**0.5 * torch.eye(2)
+    >>> implied_reward(back, torch.ones(2) / 2, back, torch.tensor([0, 1]))
+    tensor([1.9980, 1.9980])
+    """
+    moment = (backward * density.unsqueeze(-1)).mT @ backward
+    moment = moment + 1e-3 * torch.eye(len(moment), device=moment.device)
+    return (torch.linalg.solve(moment, task.mT).mT * backward[state]).sum(-1)

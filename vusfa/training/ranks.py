@@ -18,7 +18,8 @@ __all__ = ["Ranks", "check_ranks", "merged", "settings_of_rank", "share"]
 
 #: Settings that count for all ranks together, of every training and of some algorithms.
 _SHARED = {"": ("collector.num_envs",), "replay_search": ("algorithm.batch_size", "algorithm.num_goals")}
-_SHARED["contrastive"] = ("algorithm.batch_size", "algorithm.policy_pairs", "algorithm.capacity")
+for _name in ("contrastive", "forward_backward", "implicit_q"):
+    _SHARED[_name] = ("algorithm.batch_size", "algorithm.policy_pairs", "algorithm.capacity")
 _SHARED["hindsight"] = ("hindsight.batch_size", "hindsight.capacity")
 
 
