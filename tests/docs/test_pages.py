@@ -93,7 +93,7 @@ def command_line() -> Any:
 
 @cache
 def settings_of_training() -> set[str]:
-    """Every name that ``vusfa train NAME=VALUE`` takes."""
+    """Every name that ``vusfa train NAME=VALUE`` takes, with some preset."""
 
     def names(values: Any, prefix: str = "") -> Iterator[str]:
         for key, value in values.items():
@@ -102,7 +102,9 @@ def settings_of_training() -> set[str]:
                 yield from names(value, f"{prefix}{key}.")
 
     groups = {folder.name for folder in FOLDER.iterdir() if folder.is_dir()}
-    return groups | {str(name) for name in names(compose_settings([]))}
+    presets = [path.stem for path in (FOLDER / "preset").glob("*.yaml")]
+    composed = [compose_settings([]), *(compose_settings([f"preset={preset}"]) for preset in presets)]
+    return groups | {str(name) for settings in composed for name in names(settings)}
 
 
 def options_of(words: list[str]) -> tuple[str, list[str], set[str]]:
