@@ -19,8 +19,8 @@ from vusfa.evaluation.exact import exact_goals
 from vusfa.experiments.measure import evaluation_policy, measure_goals, probabilities_by_scene
 from vusfa.experiments.validation import Validation
 from vusfa.modules import InferencePolicy, TabularPolicy, make_agent
-from vusfa.scenes import Scene, SceneSet
-from vusfa.training import Trainer, make_loggers, make_trainer
+from vusfa.scenes import Scene, SceneSet, places
+from vusfa.training import Trainer, load_agent, make_loggers, make_trainer
 
 
 @pytest.fixture
@@ -82,6 +82,24 @@ def test_numbers_are_those_of_rooms_in_memory_and_a_resumed_run_goes_on(
     resumed.resume(tmp_path / "half.pt")
     run(resumed, 3)
     assert all(torch.equal(*pair) for pair in zip(values(lazy), values(resumed), strict=True))
+
+
+def test_a_setting_opens_rooms_lazily_and_an_evaluation_of_the_run_follows(
+    settings: Callable[..., Any], rooms: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def opened(*overrides: str) -> tuple[bool, bool]:
+        """Whether the training's rooms are in the files, and those of its agent when it is loaded."""
+        plain: Any = OmegaConf.to_container(settings(*SMALL, f"scenes=[{rooms}]", *overrides))
+        trainer = make_trainer(plain)
+        with trainer.collecting():
+            trainer.save(tmp_path / "checkpoint.pt")
+        return trainer.scenes.is_lazy, load_agent(tmp_path / "checkpoint.pt")[1].is_lazy
+
+    assert opened() == opened("lazy_scenes=auto") == opened("lazy_scenes=false") == (False, False)
+    assert opened("lazy_scenes=true") == (True, True)
+    monkeypatch.setattr(places, "LAZY_SCENES", 5)
+    assert opened() == (True, True)
+    assert opened("lazy_scenes=false") == (False, False)
 
 
 def test_workers_read_what_they_need(made: Callable[..., Trainer], fast_workers: None) -> None:

@@ -182,6 +182,9 @@ def _check_ranges(settings: Mapping[str, Any]) -> None:
             f"evaluation.interval is {_shown(interval)}; it must be auto, a number of frames such as 100000,"
             " or null"
         )
+    lazy = settings["lazy_scenes"]
+    if lazy != "auto" and not isinstance(lazy, bool):
+        raise ConfigError(f"lazy_scenes is {_shown(lazy)}; it must be auto, true or false")
     if not 0 <= settings["seed"] < 2**32:
         raise ConfigError(f"seed is {brief(settings['seed'])}; it must be 0 to {2**32 - 1}")
 

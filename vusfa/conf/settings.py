@@ -29,6 +29,7 @@ __all__ = [
     "OptimSettings",
     "Settings",
     "flat",
+    "lazily",
 ]
 
 #: Settings of every registered algorithm, by its name (:func:`vusfa.algorithms.register_algorithm`).
@@ -223,9 +224,9 @@ class EarlyStoppingSettings:
 class Settings:
     """All settings of a training.
 
-    ``autocast`` is true, false or ``"auto"``; ``scenes`` is a list, or one name. ``algorithm`` has the
-    settings of the one chosen, see :data:`ALGORITHMS`. ``by_model`` holds numbers of presets that depend on
-    the model.
+    ``autocast`` and ``lazy_scenes`` are true, false or ``"auto"``; ``scenes`` is a list, or one name.
+    ``algorithm`` has the settings of the one chosen, see :data:`ALGORITHMS`. ``by_model`` holds numbers of
+    presets that depend on the model.
     """
 
     env: EnvSettings
@@ -253,7 +254,19 @@ class Settings:
     overwrite: bool
     by_model: dict[str, Any] = field(default_factory=dict)
     skip_broken_scenes: bool = False
+    lazy_scenes: Any = "auto"
     cluster: ClusterSettings = field(default_factory=ClusterSettings)
+
+
+def lazily(settings: Mapping[str, Any]) -> bool | None:
+    """The argument ``lazy`` of :meth:`vusfa.scenes.SceneSet.open` that settings ask for; None: by the number
+    of files.
+
+    >>> lazily({"lazy_scenes": "auto"}), lazily({"lazy_scenes": True}), lazily({})
+    (None, True, None)
+    """
+    lazy = settings.get("lazy_scenes")
+    return lazy if isinstance(lazy, bool) else None
 
 
 def flat(settings: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:

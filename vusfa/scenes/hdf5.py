@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import mmap
 import os
+import stat
 import uuid
 from collections.abc import Collection, Iterator
 from contextlib import ExitStack, contextmanager
@@ -44,12 +45,16 @@ def opened(path: Path) -> Iterator[h5py.File]:
     Raises:
         SceneError: the file is missing, locked, unreadable, truncated, damaged, or no HDF5 file.
     """
-    if not os.path.exists(path) or path.is_dir():
-        raise SceneError(f"{path}: there is no such file; check the path")
-    if not path.is_file():
-        raise SceneError(f"{path}: is no regular file; check the path")
     try:
-        with h5py.File(path, "r") as file:
+        kind = os.stat(path).st_mode
+    except (OSError, ValueError):
+        kind = stat.S_IFDIR
+    if not stat.S_ISREG(kind):
+        fault = "there is no such file" if stat.S_ISDIR(kind) else "is no regular file"
+        raise SceneError(f"{path}: {fault}; check the path")
+    try:
+        # with the library's own settings, as h5py's are: half of the time
+        with h5py.File(h5py.h5f.open(os.fsencode(path), h5py.h5f.ACC_RDONLY)) as file:
             yield file
     except PermissionError as error:
         raise SceneError(f"{path}: may not be read ({error.strerror}); change its permissions") from error
@@ -110,12 +115,18 @@ def read_attributes(file: h5py.File, largest: int) -> dict[str, Any]:
     values, attributes = {}, file.attrs
     for key in attributes:
         declared = attributes.get_id(key)
-        kind = declared.dtype
+        kind, shape = declared.dtype, declared.shape
         held = largest if kind.hasobject else kind.itemsize
-        size, most = math.prod(declared.shape or ()) * held, limits.MAX_ATTRIBUTE_BYTES
+        size, most = math.prod(shape or ()) * held, limits.MAX_ATTRIBUTE_BYTES
         if size > most:
             raise OSError(f"attribute {brief(key)} declares up to {size} bytes; at most {most} are read")
-        values[key] = plain(attributes[key])
+        text = h5py.check_string_dtype(kind)
+        if shape is not None and text is not None and text.length is None:  # as h5py does, but opened once
+            found = np.zeros(shape, kind)
+            declared.read(found)
+            values[key] = plain(found, "surrogateescape")
+        else:
+            values[key] = plain(attributes[key])
     return values
 
 
@@ -147,10 +158,7 @@ def dataset_in(file: h5py.File, name: str) -> h5py.Dataset | None:
         OSError: its data lie outside the file (a link, external storage, a virtual dataset), or it declares
             more than :mod:`vusfa.limits` allows. Nothing outside the file is opened.
     """
-    links, key = (
-        file.id.links,
-        name.encode(),
-    )  # of the low-level interface, which takes a fraction of the time
+    links, key = file.id.links, name.encode()  # the low-level interface takes a fraction of the time
     if not links.exists(key):
         return None
     if links.get_info(key).type != h5py.h5l.TYPE_HARD:
@@ -171,9 +179,10 @@ def dataset_in(file: h5py.File, name: str) -> h5py.Dataset | None:
 def read_all(dataset: h5py.Dataset) -> np.ndarray:
     """A dataset as an array; numbers take few calls of the library."""
     there = dataset.id
-    if there.dtype.kind not in "iuf" or not there.shape or 0 in there.shape:
+    kind, shape = there.dtype, there.shape
+    if kind.kind not in "iuf" or not shape or 0 in shape:
         return np.asarray(dataset[()])
-    values = np.empty(there.shape, there.dtype)
+    values = np.empty(shape, kind)
     there.read(h5py.h5s.ALL, h5py.h5s.ALL, values)
     return values
 
@@ -272,16 +281,16 @@ def size_fault(dataset: h5py.h5d.DatasetID, made: h5py.h5p.PropDCID) -> str | No
     return None
 
 
-def plain(value: Any) -> Any:
-    """An attribute's value as str, int, float, bool, or lists of these.
+def plain(value: Any, errors: str = "replace") -> Any:
+    """An attribute's value as str, int, float, bool, or lists of these; ``errors`` as for ``bytes.decode``.
 
     >>> plain(np.array([b"a", b"b"])), plain(np.float64(0.5)), plain(np.arange(3))
     (['a', 'b'], 0.5, [0, 1, 2])
     """
     if isinstance(value, bytes):
-        return value.decode("utf-8", "replace")
+        return value.decode("utf-8", errors)
     if isinstance(value, np.ndarray | np.generic):
-        return plain(value.tolist())
+        return plain(value.tolist(), errors)
     if isinstance(value, list):
-        return [plain(item) for item in value]
+        return [plain(item, errors) for item in value]
     return value

@@ -37,7 +37,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from vusfa.conf.settings import flat
+from vusfa.conf.settings import flat, lazily
 from vusfa.envs.scene_env import usable_device
 from vusfa.errors import CheckpointError, SceneError, VusfaError
 from vusfa.files import replacing
@@ -226,7 +226,7 @@ def load_agent(
     state = load_checkpoint(path, device)
     if scenes is None:
         try:
-            scenes = SceneSet.open(state["scenes"]["sources"])
+            scenes = SceneSet.open(state["scenes"]["sources"], lazy=lazily(state["config"]))
         except SceneError as error:
             raise SceneError(
                 f"{error}; if the scenes of {path} have moved, put them beside it or give them as scenes"

@@ -11,7 +11,7 @@ from tensordict.nn import TensorDictModuleBase
 from torchrl.collectors import BaseCollector
 
 from vusfa.algorithms import make_algorithm, threads_per_step
-from vusfa.conf.settings import LARGEST
+from vusfa.conf.settings import LARGEST, lazily
 from vusfa.envs import SceneObservation, SceneRotation, resolve_goals
 from vusfa.envs.observation import crop_index
 from vusfa.envs.rotation import Rotation
@@ -57,7 +57,8 @@ def make_trainer(
     if not isinstance(settings["autocast"], bool):
         settings = {**settings, "autocast": decide_autocast(settings)}
     if scenes is None:
-        scenes = SceneSet.open(settings["scenes"], settings.get("skip_broken_scenes", False))
+        skip_broken = settings.get("skip_broken_scenes", False)
+        scenes = SceneSet.open(settings["scenes"], skip_broken, lazily(settings))
         settings = {**settings, "scenes": list(scenes.sources)}  # what a folder or a pattern stood for
     goals = resolve_goals(scenes, settings["env"]["goals"])
     task = {**settings["env"], "goals": goals}
