@@ -15,6 +15,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
@@ -127,4 +128,5 @@ class ActiveHeads:
         """What the optimizer begins with."""
         if isinstance(self._optimizer, TFRMSprop):
             return torch.full_like(weights, self._optimizer.param_groups[0]["initial_accumulator"])
-        return torch.zeros_like(weights)
+        # NumPy's zeros take no memory and no time until a scene is stored; torch's are written at once
+        return torch.from_numpy(np.zeros(tuple(weights.shape), weights.numpy().dtype))
