@@ -8,7 +8,9 @@ from typing import Any
 import pytest
 import torch
 from omegaconf import OmegaConf
+from typer.testing import CliRunner
 
+from vusfa.cli.app import app
 from vusfa.cli.launch import compose, launch
 from vusfa.errors import ConfigError, ResultError
 from vusfa.training import save_checkpoint
@@ -304,3 +306,22 @@ def test_a_name_that_the_locale_cannot_read_is_one_line(run):
     code, text = run("folder=caf\udce9")
     assert (code, text.count("\n")) == (2, 1)
     assert "caf\\udce9'\" is no text in this locale; set PYTHONUTF8=1, or rename it" in text
+
+
+@pytest.mark.parametrize(
+    "error",
+    [MemoryError(), RuntimeError("[enforce fail] DefaultCPUAllocator: can't allocate memory: 40 bytes")],
+)
+def test_memory_that_is_not_there_is_one_line(run, error: Exception, monkeypatch: pytest.MonkeyPatch):
+    def fail(*_: Any) -> int:
+        raise error
+
+    code, text = run(job=fail)
+    assert (code, text.count("\n")) == (1, 1)
+    assert text.startswith("error: out of memory; give fewer collector.num_envs")
+    monkeypatch.setattr("vusfa.scenes.validate", fail)
+    done = CliRunner().invoke(app, ["scenes", "check", "bathroom"])
+    assert (done.exit_code, done.stderr) == (
+        1,
+        "error: out of memory; close other programs, or allow more (ulimit)\n",
+    )

@@ -348,3 +348,15 @@ def test_a_log_that_is_none_ends_a_resumed_run_before_its_first_update(
     assert str(error.value).startswith(f"{path}: ")
     assert words in str(error.value)
     assert [place.name for place in tmp_path.iterdir()] == ["metrics.csv"]
+
+
+@pytest.mark.parametrize("mode", ["", "nonsense", "x" * 5000])
+def test_a_mode_of_the_environment_that_wandb_does_not_know_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, mode: str
+) -> None:
+    monkeypatch.setenv("WANDB_MODE", mode)
+    words = "WANDB_MODE is '.*'; set it to one of online, offline, disabled, or unset it"
+    with pytest.raises(ConfigError, match=words) as error:
+        make_loggers(["wandb"], tmp_path / "run", {}, run_id="a", mode="offline")
+    assert len(str(error.value)) < 500
+    assert not (tmp_path / "run").exists()

@@ -11,6 +11,7 @@ import typer
 from vusfa import __version__
 from vusfa.cli import COMMANDS, FIRST_STEPS, FUNCTIONS, TRAINING_COMMANDS
 from vusfa.cli.functions import App, Commands, forward
+from vusfa.cli.interrupts import out_of_memory
 from vusfa.errors import VusfaError
 from vusfa.limits import brief
 
@@ -34,6 +35,11 @@ class _Commands(Commands):
             if error.errno not in _WRONG_NAMES or error.filename is None:
                 raise
             typer.echo(f"error: {brief(str(error.filename))}: {error.strerror}; check the path", err=True)
+            raise typer.Exit(1) from error
+        except (MemoryError, RuntimeError) as error:
+            if not out_of_memory(error):
+                raise
+            typer.echo("error: out of memory; close other programs, or allow more (ulimit)", err=True)
             raise typer.Exit(1) from error
         except KeyboardInterrupt as interrupt:
             typer.echo("stopped", err=True)

@@ -1,11 +1,11 @@
-"""Ctrl-C while a command starts: one line instead of the traceback of an import."""
+"""What ends a command from outside in one line: Ctrl-C while it starts, and memory that is not there."""
 
 from __future__ import annotations
 
 import sys
 from types import TracebackType
 
-__all__ = ["quiet_interrupts"]
+__all__ = ["out_of_memory", "quiet_interrupts"]
 
 
 def quiet_interrupts() -> None:
@@ -22,3 +22,14 @@ def quiet_interrupts() -> None:
             sys.stderr.write("error: interrupted while starting\n")
 
     sys.excepthook = hook
+
+
+def out_of_memory(error: BaseException) -> bool:
+    """Whether an exception says that the system or a GPU has no more memory; torch raises RuntimeErrors.
+
+    >>> out_of_memory(MemoryError()), out_of_memory(RuntimeError("shapes differ"))
+    (True, False)
+    """
+    words = ("can't allocate memory", "out of memory", "Cannot allocate memory", "not enough memory")
+    said = isinstance(error, RuntimeError) and any(word in str(error) for word in words)
+    return isinstance(error, MemoryError) or said

@@ -30,6 +30,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 import vusfa.algorithms  # noqa: F401  (registers those of this package)
+from vusfa.cli.interrupts import out_of_memory
 from vusfa.cli.resume import resumed_settings
 from vusfa.conf import FOLDER
 from vusfa.conf import compose as conf_compose
@@ -212,6 +213,11 @@ def _report(job: Callable[[], int], folder: Path) -> int:
     except OSError as error:
         where = f"{error.filename}: " if error.filename else ""
         return _complain(f"{where}{error.strerror or error}; a checkpoint written before is whole", FAILED)
+    except (MemoryError, RuntimeError) as error:
+        if not out_of_memory(error):
+            raise
+        where = "; give fewer collector.num_envs or a shorter collector.rollout, or allow more (ulimit)"
+        return _complain(f"out of memory{where}; a checkpoint written before is whole", FAILED)
     except KeyboardInterrupt:
         return _complain("interrupted; a checkpoint written before this is whole", INTERRUPTED)
 

@@ -18,6 +18,7 @@ from PIL import Image
 
 from vusfa.conf.settings import flat
 from vusfa.errors import ConfigError
+from vusfa.limits import brief
 from vusfa.training.facts import versions
 
 __all__ = ["TensorBoardLogger", "WandbLogger", "sweep_run_id"]
@@ -118,6 +119,14 @@ class WandbLogger:
         modes = ("online", "offline", "disabled")
         if mode is not None and mode not in modes:
             raise ConfigError(f"logger.mode is {mode!r}; it must be one of {', '.join(modes)}")
+        if os.environ.get("WANDB_MODE", "online") not in (
+            *modes,
+            "shared",
+            "dryrun",
+            "run",
+        ):  # wandb reads it whatever it is given
+            found = brief(os.environ["WANDB_MODE"])
+            raise ConfigError(f"WANDB_MODE is {found}; set it to one of {', '.join(modes)}, or unset it")
         files = Path(folder) / "wandb"
         missing = [place for place in (files, *files.parents) if not place.exists()]
         Path(folder).mkdir(parents=True, exist_ok=True)  # wandb writes elsewhere where there is no folder
