@@ -46,6 +46,9 @@ def test_of_an_algorithm() -> None:
         checked("algorithm=replay_search", "algorithm.batch_size=10000000000000")
     with pytest.raises(ConfigError, match=r"^algorithm\.path_share is nan; it must be a finite number"):
         checked("algorithm=replay_search", "algorithm.path_share=nan")
+    for name in ("capacity", "policy_pairs", "horizon"):
+        with pytest.raises(ConfigError, match=f"algorithm.{name} is 10000000000000; it must be at most"):
+            checked("algorithm=contrastive", f"algorithm.{name}=10000000000000")
 
 
 def test_keys_of_a_mapping_are_given_as_the_documents_say() -> None:

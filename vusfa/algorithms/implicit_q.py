@@ -56,7 +56,7 @@ class ImplicitQSettings(GoalLearningSettings):
 
     step_cost: float = 0.2
     expectile: float = 0.9
-    target_rate: float = 0.2
+    target_rate: float = 0.9
     own_weight: float = 1.0
     discount: float = 0.95
     temperature: float = 0.02

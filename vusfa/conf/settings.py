@@ -55,6 +55,9 @@ LARGEST = {
     "hindsight.capacity": 1 << 28,
     "hindsight.batch_size": 1 << 24,
     "algorithm.batch_size": 1 << 24,
+    "algorithm.policy_pairs": 1 << 24,
+    "algorithm.capacity": 1 << 28,
+    "algorithm.horizon": 1 << 16,
 }
 
 
