@@ -50,9 +50,9 @@ def drawn_steps(most: Tensor, discount: float | None = None) -> Tensor:
     >>> drawn_steps(torch.tensor([1, 1, 1]), 0.9)
     tensor([1, 1, 1])
     """
+    if discount is None:  # in float32, as version 0.1 drew them
+        return 1 + (torch.rand_like(most, dtype=torch.float32) * most).long()
     share = torch.rand_like(most, dtype=torch.float64)
-    if discount is None:
-        return 1 + (share * most).long()
     # the inverse of P(k <= x) = (1 - gamma^x) / (1 - gamma^n)
     below = torch.log1p(-share * (1 - discount ** most.double())) / math.log(discount)
     return torch.minimum(1 + below.long(), most)
