@@ -179,18 +179,14 @@ def _quoted(argument: str, sweeps: bool = False) -> str:
     if value[:1] in ("'", '"') or "${" in value or (name == "folder" and "," in value and sweeps):
         return argument
     if name in ("resume", "folder"):
-        return f"{name}={_as_text(value)}" if re.search(r"[^\w./~@%+*$-]", value, re.ASCII) else argument
+        return f"{name}={conf_compose.as_text(value)}"
     if value.isascii() or re.search(r"['\"{}()]|\[.*\[", value):
         return argument
     if value[:1] == "[" and value[-1:] == "]":
         parts = [part.strip() for part in value[1:-1].split(",")]
-        return f"{name}=[{','.join(part if part.isascii() else _as_text(part) for part in parts)}]"
-    return f"{name}={_as_text(value)}"
-
-
-def _as_text(value: str) -> str:
-    escaped = re.sub(r"(\\*)'", lambda found: found[1] * 2 + "\\'", value)
-    return f"'{escaped}'"
+        parts = [part if part.isascii() else conf_compose.as_text(part) for part in parts]
+        return f"{name}=[{','.join(parts)}]"
+    return f"{name}={conf_compose.as_text(value)}"
 
 
 def _report(job: Callable[[], int], folder: Path) -> int:

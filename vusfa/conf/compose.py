@@ -15,7 +15,7 @@ from omegaconf import DictConfig, OmegaConf
 from vusfa.conf import FOLDER
 from vusfa.conf.settings import flat
 
-__all__ = ["appended", "compose", "default_settings"]
+__all__ = ["appended", "as_text", "compose", "default_settings"]
 
 
 def appended(override: str) -> str:
@@ -25,6 +25,19 @@ def appended(override: str) -> str:
     ('++env.scene_weights={hall: 2}', 'seed=1')
     """
     return f"++{override}" if re.match(r"(env\.scene_weights|optim\.options)[.=]", override) else override
+
+
+def as_text(value: str) -> str:
+    """A value as Hydra reads it: in quotes where it has characters that mean something to it, or that it
+    cannot read, which is all but ASCII.
+
+    >>> as_text("runs/first"), as_text("runs/lr=1,2"), as_text("küche")
+    ('runs/first', "'runs/lr=1,2'", "'küche'")
+    """
+    if re.fullmatch(r"[\w./~@%+*$-]*", value, re.ASCII):
+        return value
+    escaped = re.sub(r"(\\*)('|\Z)", lambda found: found[1] * 2 + "\\'" * bool(found[2]), value)
+    return f"'{escaped}'"
 
 
 def compose(folder: Path = FOLDER, name: str = "train", overrides: Sequence[str] = ()) -> DictConfig:

@@ -11,6 +11,7 @@ from typing import Any
 import torch
 
 from vusfa.cluster.cells import Cell, run_cells
+from vusfa.conf.compose import as_text
 from vusfa.errors import SceneError
 from vusfa.evaluation import Episodes, evaluate, print_summary, random_walk_summary, summary
 from vusfa.evaluation.exact import exact_goals, uniform_probabilities
@@ -131,9 +132,9 @@ def generalise_cell(
     results, runs = how["results"], how["runs"]
     torch.set_num_threads(1)
     unseen, folder = SceneSet.open(last), runs / "generalise" / f"{name}-{seed}"
-    settings = ["preset=unseen", *overrides, f"seed={seed}", f"scenes=[{','.join(first)}]"]
+    settings = ["preset=unseen", *overrides, f"seed={seed}", f"scenes=[{','.join(map(as_text, first))}]"]
     if not (folder / "checkpoint.pt").exists():
-        cfg = compose_settings([*settings, f"folder={folder}", "evaluation=none"])
+        cfg = compose_settings([*settings, f"folder={as_text(str(folder))}", "evaluation=none"])
         if code := train(cfg, settings).exit_code:
             sys.exit(code)
     agent, _, state = load_agent(folder / "checkpoint.pt")

@@ -13,6 +13,7 @@ from typing import Any
 from omegaconf import open_dict
 
 from vusfa.cluster.cells import Cell, run_cells
+from vusfa.conf.compose import as_text
 from vusfa.errors import ConfigError, check_choices
 from vusfa.experiments.measure import choose_checkpoint, measure_checkpoint
 from vusfa.experiments.runs import check_run_name, read_run, write_run
@@ -29,7 +30,7 @@ def checkpoints(folder: Path, overrides: list[str], stages: list[float]) -> list
 
     With ``early_stopping.success`` the only checkpoint is the one that the training ended with.
     """
-    cfg = compose_settings([*overrides, f"folder={folder}", "evaluation.goals=null"])
+    cfg = compose_settings([*overrides, f"folder={as_text(str(folder))}", "evaluation.goals=null"])
     if cfg.early_stopping.success is not None:
         stages = stages[-1:]
     # interpolated now: schedules end where the whole training ends, whichever part of it runs

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shlex
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack, redirect_stderr, suppress
 from functools import partial
@@ -152,7 +153,8 @@ def _train(plain: dict[str, Any], overrides: Sequence[str], draw: Draw | None, r
             loggers.log_table("evaluation", comparison.rows, trainer.frames)
             with suppress(BrokenPipeError):
                 print_summary(comparison.rows, note=comparison.note)
-    say(f"next: vusfa report {place}, vusfa film {place}, vusfa evaluate {place}")
+    run = shlex.quote(str(place))
+    say(f"next: vusfa report {run}, vusfa film {run}, vusfa evaluate {run}")
     say(str(path))
     if validation is not None and not stop.received and (advice := validation.advice()):
         say(advice)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shlex
 import sys
 from functools import partial
 from pathlib import Path
@@ -136,5 +137,6 @@ def evaluate_checkpoint(checkpoint: Path, stem: Path, **how: Any) -> str:
         raise KeyboardInterrupt("interrupted; nothing has been written") from interrupt
     result.settings["manifest"] = manifest
     print_summary(result.rows, note=result.note)
-    print(f"next: vusfa report {checkpoint.parent}, vusfa film {checkpoint.parent}", file=sys.stderr)
+    run = shlex.quote(str(checkpoint.parent))
+    print(f"next: vusfa report {run}, vusfa film {run}", file=sys.stderr)
     return "\n".join(map(str, result.save(stem)))
