@@ -120,7 +120,8 @@ def test_a_resumed_training_goes_on_as_the_first(scene_file: Path, tmp_path: Pat
     second.resume(path)
     with second.collecting() as batches:
         found = second.update(batches)[1]
-    torch.testing.assert_close(found, expected, rtol=0, atol=0)
+    # sums over rows that lie elsewhere in memory may be rounded in another order
+    torch.testing.assert_close(found, expected, rtol=1e-6, atol=1e-8)
 
 
 def test_weights_of_another_algorithm_are_refused(scene_file: Path) -> None:

@@ -7,6 +7,7 @@ import os
 import queue
 import re
 import signal
+import threading
 import time
 from collections.abc import Callable
 from functools import partial
@@ -199,8 +200,13 @@ def test_a_suspended_training_with_a_short_limit_does_not_accuse_its_workers(mon
         let_pass(1.0, now, silence)
 
 
+@pytest.mark.parametrize("threads", [0, 1])
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_to_all_processes_while_workers_start(number: signal.Signals):
+def test_a_signal_to_all_processes_while_workers_start(number: signal.Signals, threads: int):
+    """With other threads in this process one of them receives it."""
+    ended_thread = threading.Event()
+    for _ in range(threads):
+        threading.Thread(target=ended_thread.wait, daemon=True).start()
     received: list[int] = []
     pid: list[int] = []
     before = signal.signal(number, lambda *_: received.append(number))
@@ -226,6 +232,7 @@ def test_a_signal_to_all_processes_while_workers_start(number: signal.Signals):
         assert received == [number]
         assert signal.pthread_sigmask(signal.SIG_BLOCK, []) == blocked
     finally:
+        ended_thread.set()
         signal.signal(number, before)
 
 

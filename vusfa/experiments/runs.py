@@ -163,6 +163,8 @@ def read_run(root: str | Path, experiment: str, name: str) -> Run:
     folder = Path(root) / experiment / name
     path = folder / "cell.json"
     if not os.path.lexists(path):
+        if folder.is_dir():
+            raise ResultError(f"{path}: there is no such file, so the folder holds no results; {_AGAIN}")
         raise no_results(folder.parent, name)
     content = read_json(path, ResultError, _AGAIN)
     content = {"episodes": [], "scenes": [], "max_steps": 0, **content}
@@ -193,7 +195,8 @@ def no_results(folder: str | Path, *names: str, command: str = "") -> ResultErro
     '/no/such: no results of table1; there are none'
     """
     mend = f"; run {command} first" if command else ""
-    there = {place.relative_to(folder).parts[0] for place in Path(folder).glob("**/cell.json")}
+    places = [place for depth in ("*", "*/*") for place in Path(folder).glob(f"{depth}/cell.json")]
+    there = {place.relative_to(folder).parts[0] for place in places}
     return ResultError(
         f"{folder}: no results of {' or '.join(names)}; there are {listing(sorted(there)) or 'none'}{mend}"
     )

@@ -4,12 +4,16 @@ from __future__ import annotations
 
 import signal
 import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from multiprocessing import resource_tracker
 from types import FrameType, TracebackType
 from typing import Any
 
-__all__ = ["StopOnSignal"]
+__all__ = ["STOPPING", "StopOnSignal", "signals_held"]
 
-_STOPPING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+#: Signals that end a training.
+STOPPING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
 class StopOnSignal:
@@ -39,7 +43,7 @@ class StopOnSignal:
     def __enter__(self) -> StopOnSignal:
         if threading.current_thread() is not threading.main_thread():  # only that one may set handlers
             return self
-        for number in _STOPPING:
+        for number in STOPPING:
             if number != signal.SIGHUP or signal.getsignal(number) != signal.SIG_IGN:
                 self._before[number] = signal.signal(number, self._note)
         return self
@@ -60,6 +64,40 @@ class StopOnSignal:
         while self._before:
             number, handler = self._before.popitem()
             signal.signal(number, handler)
+
+
+@contextmanager
+def signals_held() -> Iterator[Callable[[], None]]:
+    """Context in which signals that end a training wait; its function raises what one that has come asks for.
+
+    They are blocked in this thread, and so in the processes that it starts. Another thread may receive one;
+    its handler is then called here, notes it, and sends it again afterwards.
+
+    >>> with signals_held() as end_if_signaled:
+    ...     end_if_signaled()  # KeyboardInterrupt or SystemExit, if a signal has come
+    """
+    noted: list[int] = []
+    handlers: dict[int, Any] = {}
+    if threading.current_thread() is threading.main_thread():
+        handlers = {number: signal.getsignal(number) for number in STOPPING}
+        handlers = {number: now for number, now in handlers.items() if now not in (None, signal.SIG_IGN)}
+    for number in handlers:
+        signal.signal(number, lambda number, frame: noted.append(number))
+
+    def end_if_signaled() -> None:
+        for number in {*noted, *signal.sigpending()}.intersection(STOPPING):
+            raise KeyboardInterrupt if number == signal.SIGINT else SystemExit(128 + number)
+
+    resource_tracker.ensure_running()  # which ends by unblocking signals
+    blocked = signal.pthread_sigmask(signal.SIG_BLOCK, STOPPING)
+    try:
+        yield end_if_signaled
+    finally:
+        for number, handler in handlers.items():
+            signal.signal(number, handler)
+        signal.pthread_sigmask(signal.SIG_SETMASK, blocked)
+        for number in noted:
+            signal.raise_signal(number)
 
 
 def _caused_by_interrupt(error: BaseException | None) -> bool:

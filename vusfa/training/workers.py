@@ -15,7 +15,6 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
-from multiprocessing import resource_tracker
 from types import FrameType
 from typing import Any
 
@@ -23,6 +22,7 @@ import torch
 from torchrl.collectors import BaseCollector, MultiSyncCollector
 
 from vusfa.errors import VusfaError, WorkerError
+from vusfa.training.signals import STOPPING, signals_held
 
 __all__ = ["Silence", "begin_worker", "end_of", "started", "supervised", "watch"]
 
@@ -31,8 +31,6 @@ __all__ = ["Silence", "begin_worker", "end_of", "started", "supervised", "watch"
 #: against its workers.
 LONGEST_WAIT = 10.0
 _PR_SET_PDEATHSIG = 1
-#: Signals that end a training.
-_ENDING = {signal.SIGINT, signal.SIGTERM, signal.SIGHUP}
 
 
 def begin_worker(autocast: bool) -> None:
@@ -43,7 +41,8 @@ def begin_worker(autocast: bool) -> None:
     """
     for number in (signal.SIGINT, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)
-    signal.pthread_sigmask(signal.SIG_UNBLOCK, _ENDING)  # see started()
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)  # a forked one has handlers of the main process
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, STOPPING)  # see started()
     if sys.platform.startswith("linux"):
         with suppress(AttributeError, OSError):
             ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
@@ -82,7 +81,7 @@ def started(limit: float | None, *, may_end: bool = False) -> Iterator[None]:
     alive = (None, 0) if may_end else (None,)
 
     def look(number: int, frame: FrameType | None) -> None:
-        _end_if_signaled()
+        end_if_signaled()
         seen.update(child for child in multiprocessing.active_children() if child not in before)
         dead = [end_of(child.pid, child.exitcode) for child in seen if child.exitcode not in alive]
         if dead:
@@ -90,27 +89,24 @@ def started(limit: float | None, *, may_end: bool = False) -> Iterator[None]:
         if limit is not None and time.monotonic() - began > limit:
             raise WorkerError(f"they have not begun within {limit:g} s (collector.timeout)")
 
-    resource_tracker.ensure_running()  # which ends by unblocking signals
-    others = _children()
-    blocked = signal.pthread_sigmask(signal.SIG_BLOCK, _ENDING)
-    try:
-        with _every_second(look):
-            yield
-    except BaseException as error:
-        for child in set(multiprocessing.active_children()) - before:
-            child.kill()
-            child.join()
-        for pid in _children() - others:  # one that was interrupted in its start is in no list
-            with suppress(ProcessLookupError, ChildProcessError):
-                os.kill(pid, signal.SIGKILL)
-                os.waitpid(pid, 0)
-        _end_if_signaled()  # TorchRL may have made something else of it
-        known = isinstance(error, VusfaError) and not isinstance(error, WorkerError)
-        if known or not isinstance(error, Exception):
-            raise
-        raise _cannot_start(error) from error
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, blocked)
+    with signals_held() as end_if_signaled:
+        others = _children()
+        try:
+            with _every_second(look):
+                yield
+        except BaseException as error:
+            for child in set(multiprocessing.active_children()) - before:
+                child.kill()
+                child.join()
+            for pid in _children() - others:  # one that was interrupted in its start is in no list
+                with suppress(ProcessLookupError, ChildProcessError):
+                    os.kill(pid, signal.SIGKILL)
+                    os.waitpid(pid, 0)
+            end_if_signaled()  # TorchRL may have made something else of it
+            known = isinstance(error, VusfaError) and not isinstance(error, WorkerError)
+            if known or not isinstance(error, Exception):
+                raise
+            raise _cannot_start(error) from error
 
 
 def _children() -> set[int]:
@@ -120,11 +116,6 @@ def _children() -> set[int]:
             return {int(pid) for pid in file.read().split()}
     except OSError:
         return set()
-
-
-def _end_if_signaled() -> None:
-    for number in signal.sigpending() & _ENDING:
-        raise KeyboardInterrupt if number == signal.SIGINT else SystemExit(128 + number)
 
 
 def _cannot_start(error: Exception) -> WorkerError:
