@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -13,7 +13,7 @@ from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
 from vusfa.algorithms.base import Algorithm, AlgorithmSettings, check_replay
 from vusfa.algorithms.registry import ALGORITHMS
-from vusfa.algorithms.replay import HindsightReplay, merge_replays, share_of_replay
+from vusfa.algorithms.replay import HindsightReplay, RankedReplay
 from vusfa.errors import CheckpointError, ConfigError
 from vusfa.modules import Agent
 from vusfa.objectives.scores import ScoreLoss
@@ -125,7 +125,7 @@ def slow_copy(critic: nn.Module, rate: float) -> AveragedModel:
     return AveragedModel(critic, multi_avg_fn=get_ema_multi_avg_fn(1 - rate))
 
 
-class GoalLearning(Algorithm):
+class GoalLearning(RankedReplay, Algorithm):
     """Base: a critic of all pairs of states and goals, by a subclass's loss, and a policy from its scores.
 
     The agent walks to its trained goals, and its transitions go into a replay buffer. From samples of it the
@@ -271,17 +271,6 @@ class GoalLearning(Algorithm):
             "replay": self.replay.state_dict(),
             "learns": self._learns,
         }
-
-    def merge_states(self, states: Sequence[dict[str, Any]]) -> dict[str, Any]:
-        """With the replay buffer that one process would have."""
-        if None in states:
-            raise CheckpointError("the replay buffers of other ranks are gone")
-        return {**states[0], "replay": merge_replays([state["replay"] for state in states])}
-
-    def share_of_state(self, state: dict[str, Any], rank: int, size: int) -> dict[str, Any]:
-        """With the transitions of the rank's environments."""
-        replay = state.get("replay")
-        return {**state, "replay": share_of_replay(replay, rank, size)} if replay else state
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Continue with critic and replay buffer; a ``CheckpointError`` where the state has none."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 from tensordict import TensorDictBase
@@ -10,7 +10,7 @@ from torch import Tensor
 
 from vusfa.algorithms.base import check_replay
 from vusfa.algorithms.registry import register_algorithm
-from vusfa.algorithms.replay import HindsightReplay, merge_replays, share_of_replay
+from vusfa.algorithms.replay import HindsightReplay, RankedReplay
 from vusfa.algorithms.usf import USF
 from vusfa.errors import CheckpointError, ConfigError
 from vusfa.modules import Agent
@@ -25,7 +25,7 @@ _OF_LOSS = ("critic_coeff", "objective_coeff", "expectile", "temperature", "max_
 
 
 @register_algorithm("hindsight")
-class Hindsight(USF):
+class Hindsight(RankedReplay, USF):
     """:class:`~vusfa.algorithms.USF`, and :class:`~vusfa.objectives.HindsightLoss` on transitions from
     :class:`~vusfa.algorithms.HindsightReplay`, with the numbers of ``settings["hindsight"]``.
 
@@ -78,17 +78,6 @@ class Hindsight(USF):
     def state_dict(self) -> dict[str, Any]:
         """The loss's buffers, and the replay buffer."""
         return {**super().state_dict(), "replay": self.replay.state_dict()}
-
-    def merge_states(self, states: Sequence[dict[str, Any]]) -> dict[str, Any]:
-        """With the replay buffer that one process would have."""
-        if None in states:
-            raise CheckpointError("the replay buffers of other ranks are gone")
-        return {**states[0], "replay": merge_replays([state["replay"] for state in states])}
-
-    def share_of_state(self, state: dict[str, Any], rank: int, size: int) -> dict[str, Any]:
-        """With the transitions of the rank's environments."""
-        replay = state.get("replay")
-        return {**state, "replay": share_of_replay(replay, rank, size)} if replay else state
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Continue with the replay buffer; a ``CheckpointError`` where the state has none."""

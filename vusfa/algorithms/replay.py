@@ -16,9 +16,9 @@ from torch import Tensor
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 
 from vusfa.algorithms.hindsight_goals import HindsightSampler
-from vusfa.errors import ConfigError
+from vusfa.errors import CheckpointError, ConfigError
 
-__all__ = ["HindsightReplay", "merge_replays", "share_of_replay"]
+__all__ = ["HindsightReplay", "RankedReplay", "merge_replays", "share_of_replay"]
 
 
 class HindsightReplay:
@@ -147,6 +147,21 @@ class HindsightReplay:
             self.buffer.writer.load_state_dict(writer)
         self._clock = state["clock"]
         self.sampler.load_state_dict(state["sampler"])
+
+
+class RankedReplay:
+    """Base of algorithms with a :class:`HindsightReplay`, whose states ranks share out and join."""
+
+    def merge_states(self, states: Sequence[dict[str, Any]]) -> dict[str, Any]:
+        """With the replay buffer that one process would have."""
+        if None in states:
+            raise CheckpointError("the replay buffers of other ranks are gone")
+        return {**states[0], "replay": merge_replays([state["replay"] for state in states])}
+
+    def share_of_state(self, state: dict[str, Any], rank: int, size: int) -> dict[str, Any]:
+        """With the transitions of the rank's environments."""
+        replay = state.get("replay")
+        return {**state, "replay": share_of_replay(replay, rank, size)} if replay else state
 
 
 def merge_replays(states: Sequence[dict[str, Any]]) -> dict[str, Any]:
