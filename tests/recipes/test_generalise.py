@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 
 from vusfa.errors import SceneError
+from vusfa.evaluation.searchers import SEARCHERS
 from vusfa.experiments.generalise import split_rooms
 from vusfa.experiments.runs import read_run
 from vusfa.scenes import Scene
@@ -49,7 +50,8 @@ def test_trained_in_some_rooms_and_tested_in_others(
     cell = read_run(tmp_path / "results", "generalise", "vusfa-0")
     assert cell.info["trained_in"] == ["hall-1", "attic-2", "attic-9"]
     assert cell.info["tested_in"] == ["hall"]
-    assert sorted(cell.episodes) == ["agent", "agent-memory", "memory"]
+    assert tuple(cell.episodes) == ("agent", "agent-memory", "memory", *SEARCHERS)
+    assert cell.episodes["shortest-path"].success.all()
     sizes = {way: len(table) for way, table in cell.episodes.items()}
     assert set(sizes.values()) == {2 * len(cell.episodes["agent"].goal.unique())}
     assert not cell.episodes["agent"].trained.any()

@@ -8,6 +8,7 @@ from vusfa.evaluation.comparison import Comparison, check_comparison, compare
 from vusfa.evaluation.episodes import Episodes
 from vusfa.evaluation.metrics import METRICS, Metric, get_metric, register_metric
 from vusfa.evaluation.navigation import evaluate, trails, walk
+from vusfa.evaluation.searchers import evaluate_searchers
 from vusfa.evaluation.starts import episode_starts
 from vusfa.evaluation.summary import print_summary, random_walk_summary, summary
 
@@ -20,6 +21,7 @@ __all__ = [
     "compare",
     "episode_starts",
     "evaluate",
+    "evaluate_searchers",
     "get_metric",
     "print_summary",
     "random_walk",

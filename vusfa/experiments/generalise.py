@@ -13,8 +13,16 @@ import torch
 from vusfa.cluster.cells import Cell, run_cells
 from vusfa.conf.compose import as_text
 from vusfa.errors import SceneError
-from vusfa.evaluation import Episodes, evaluate, print_summary, random_walk_summary, summary
+from vusfa.evaluation import (
+    Episodes,
+    evaluate,
+    evaluate_searchers,
+    print_summary,
+    random_walk_summary,
+    summary,
+)
 from vusfa.evaluation.exact import exact_goals, uniform_probabilities
+from vusfa.evaluation.searchers import check_searched
 from vusfa.experiments.runs import Run, check_run_name, read_run, write_run
 from vusfa.experiments.training import compose_settings, train
 from vusfa.files import check_folder, say
@@ -67,6 +75,7 @@ def generalise(
     weight: float = 3.0,
     temperature: float = 1.0,
     episodes: int = 10,
+    searchers: bool = True,
     results: Path = Path("results"),
     runs: Path = Path("runs"),
     again: bool = False,
@@ -76,7 +85,8 @@ def generalise(
     """Train in some rooms, test in others that the agent has never seen.
 
     The agent, whose heads are the same for all rooms, walks to every goal of the other rooms as it is and
-    with a memory of the episode; beside it the random walk and the memory alone. Results go to
+    with a memory of the episode; beside it the random walk, the memory alone, and searchers that know the
+    map but not where the goal is (:mod:`vusfa.evaluation.searchers`). Results go to
     RESULTS/generalise/NAME-SEED, and existing ones are skipped; ``vusfa tables generalise`` prints the table
     of all seeds, with intervals.
 
@@ -91,17 +101,21 @@ def generalise(
         weight: of the memory: off the logits for each time that an action was tried here.
         temperature: of the agent's logits, beside the memory.
         episodes: to every goal of the rooms to test in.
+        searchers: evaluate those that know the map, too.
         results: where results are written.
         runs: where the checkpoint is kept.
         again: test the agents of existing results again.
         launcher, launcher_options: what runs the cells: serial, local, slurm or ray (docs/cluster.md).
     """
     how: dict[str, Any] = {"weight": weight, "temperature": temperature, "episodes": episodes}
-    how |= {"results": results, "runs": runs}
+    how |= {"searchers": searchers, "results": results, "runs": runs}
     check_run_name(f"{name}-{seed}")
     check_folder(runs / "generalise", "runs")
     first, last = split_rooms(rooms, trained, tested)
     compose_settings(["preset=unseen", *overrides])  # mistakes show before any work
+    unseen = SceneSet.open(last)
+    if searchers:
+        check_searched(unseen)
     cells = {
         each: Cell(
             results / "generalise" / f"{name}-{each}",
@@ -110,7 +124,6 @@ def generalise(
         for each in seeds or [seed]
     }
     run_cells(list(cells.values()), launcher, launcher_options, again)
-    unseen = SceneSet.open(last)
     none, every = torch.tensor([], dtype=torch.int64), torch.arange(unseen.num_states)
     for each in cells:
         tables = read_run(results, "generalise", f"{name}-{each}").episodes
@@ -150,6 +163,8 @@ def generalise_cell(
                 batch_size=1024,
                 progress=lambda done, total, who=who: progress(who, done, total),  # type: ignore[misc]
             )
+    if how["searchers"]:
+        tables |= evaluate_searchers(tables["agent"], unseen)
     facts = {**run_facts(state, overrides), "trained_in": [Path(p).stem for p in first]}
     info = {**facts, "memory_weight": weight, "temperature": temperature, "tested_in": list(unseen.names)}
     walk = exact_goals(uniform_probabilities(unseen.num_actions), unseen)
