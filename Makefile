@@ -19,9 +19,10 @@ $(STAMP): pyproject.toml constraints.txt
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[dev]'
 	touch $@
 
-# A renderer for the tests marked `render`. Furniture and LLVM are packages of the system; README.md names them.
+# A renderer and a simulator for the tests marked `render` and `miniworld`. Furniture, LLVM, EGL and Mesa are packages of the
+# system; README.md names them.
 $(RENDER): $(STAMP)
-	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[dev,render]'
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[dev,render,miniworld]'
 	touch $@
 
 # What the site is built with: Sphinx, MyST-NB and the theme.

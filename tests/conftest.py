@@ -12,6 +12,8 @@ import sys
 import time
 import zlib
 from collections.abc import Callable, Iterator
+from functools import cache
+from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, ClassVar
@@ -23,10 +25,11 @@ import pytest
 import torch
 import torch.multiprocessing
 from omegaconf import DictConfig, OmegaConf
+from PIL import Image
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 
-from vusfa.errors import SceneError
+from vusfa.errors import ConfigError, SceneError
 from vusfa.scenes import Scene, SceneSet
 from vusfa.scenes.graph import shortest_path_distances
 from vusfa.sources.render.catalogue import Catalogue
@@ -55,17 +58,42 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 
 def pytest_runtest_setup(item: pytest.Item) -> None:
-    """Tests marked ``render`` are skipped where a renderer is missing; under CI they fail there."""
-    if not item.get_closest_marker("render"):
-        return
+    """Tests marked ``render`` and ``miniworld`` are skipped where those are missing; under CI they fail
+    there."""
+    for mark, missing in (("render", _no_renderer), ("miniworld", _no_miniworld)):
+        if item.get_closest_marker(mark) and (what := missing()):
+            lacking(what)
+
+
+def _no_renderer() -> str:
     packages = ("mitsuba", "mitsuba_oidn", "trimesh", "efficientnet_lite_pytorch")
     missing = [name for name in packages if not find_spec(name)]
     try:
         Catalogue.open()
     except SceneError:
         missing.append("furniture (Debian's sweethome3d-furniture)")
-    if missing:
-        lacking(", ".join(missing))
+    return ", ".join(missing)
+
+
+@cache
+def _no_miniworld() -> str:
+    from vusfa.sources.miniworld import find_miniworld
+
+    try:
+        find_miniworld()
+    except ConfigError as error:
+        return str(error)
+    pyglet = import_module("pyglet")
+    pyglet.image.load = _quick_texture  # pyglet adds a channel by a regular expression, a second per texture
+    return ""
+
+
+def _quick_texture(path: str) -> Any:
+    """A picture as ``pyglet.image.load`` gives it, in RGBA."""
+    with Image.open(path) as picture:
+        rows = np.ascontiguousarray(np.flipud(picture.convert("RGBA")))
+    height, width, _ = rows.shape
+    return import_module("pyglet.image").ImageData(width, height, "RGBA", rows.tobytes())
 
 
 def lacking(what: str) -> None:

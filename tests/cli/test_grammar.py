@@ -155,6 +155,7 @@ WRITING = {
     "encode": ["scenes", "encode", "bathroom", "TARGET"],
     "compact": ["scenes", "compact", "bathroom", "TARGET"],
     "export-thor": ["scenes", "export-thor", "FloorPlan1", "TARGET"],
+    "export-miniworld": ["scenes", "export-miniworld", "MiniWorld-OneRoom-v0", "TARGET"],
     "render": ["scenes", "render", "plan=bathroom", "--out", "TARGET"],
     "export": ["export", "vusfa", "TARGET"],
 }

@@ -23,6 +23,7 @@ COMMANDS = [
     "vusfa.cli.inspect",
     "vusfa.cli.photos",
     "vusfa.cli.thor",
+    "vusfa.cli.miniworld",
     "vusfa.cli.encode",
     "vusfa.cli.augment",
     "vusfa.cli.fetch",

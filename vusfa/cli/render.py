@@ -8,13 +8,13 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from vusfa.cli.sources import Force, check_target, say_next
+from vusfa.cli.sources import Force, Network, Weights, check_target, say_next
 from vusfa.errors import ConfigError
 
 if TYPE_CHECKING:
     from vusfa.sources.render.plan import Plan
 
-__all__ = ["Samples", "Scalar", "Threads", "Weights", "Width", "find_plan", "register", "with_camera"]
+__all__ = ["Samples", "Scalar", "Threads", "Width", "find_plan", "register", "with_camera"]
 
 Width = Annotated[
     int | None,
@@ -25,7 +25,6 @@ Width = Annotated[
 Samples = Annotated[
     int | None, typer.Option(min=1, help="Light paths per pixel before denoising; by default the plan's, 4.")
 ]
-Weights = Annotated[Path | None, typer.Option(help="File of the network's weights.")]
 Scalar = Annotated[
     bool, typer.Option("--scalar", help="Render without LLVM even if it is installed; much slower.")
 ]
@@ -105,9 +104,7 @@ def render(
             " blur, all, train1 to train6, validate1, validate2, or a YAML file of changes."
         ),
     ] = None,
-    backbone: Annotated[
-        str, typer.Option(help="Network that computes the features; see `vusfa scenes encode --help`.")
-    ] = "efficientnet-lite0",
+    backbone: Network = "efficientnet-lite0",
     weights: Weights = None,
     width: Width = None,
     samples: Samples = None,

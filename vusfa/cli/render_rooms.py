@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import typer
 
-from vusfa.cli.render import Samples, Scalar, Threads, Weights, Width, find_plan, with_camera
+from vusfa.cli.render import Samples, Scalar, Threads, Width, find_plan, with_camera
+from vusfa.cli.sources import Network, Weights
 from vusfa.errors import ConfigError, VusfaError
 from vusfa.limits import brief
 
@@ -137,9 +138,7 @@ def render_rooms(
     ] = None,
     width: Width = None,
     samples: Samples = None,
-    backbone: Annotated[
-        str, typer.Option(help="Network that computes the features; see `vusfa scenes encode --help`.")
-    ] = "efficientnet-lite0",
+    backbone: Network = "efficientnet-lite0",
     weights: Weights = None,
     scalar: Scalar = False,
     threads: Threads = None,

@@ -5,16 +5,45 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from vusfa.errors import ConfigError, SceneError
 
-__all__ = ["Force", "check_target", "has_graph", "say_next", "scene_path", "scene_paths"]
+if TYPE_CHECKING:
+    from vusfa.scenes import Scene
+
+__all__ = [
+    "Batch",
+    "Crops",
+    "Force",
+    "Height",
+    "Layer",
+    "Network",
+    "Weights",
+    "Width",
+    "check_target",
+    "has_graph",
+    "say_exported",
+    "say_next",
+    "scene_path",
+    "scene_paths",
+]
 
 #: The option of commands that write a file.
 Force = Annotated[bool, typer.Option("--force", help="Replace the file if it exists.")]
+#: Options of commands that compute features.
+Network = Annotated[
+    str, typer.Option(help="Network that computes the features; see `vusfa scenes encode --help`.")
+]
+Weights = Annotated[Path | None, typer.Option(help="File of the network's weights.")]
+Layer = Annotated[str | None, typer.Option(help="Layer whose output is taken, such as avgpool.")]
+Crops = Annotated[str | None, typer.Option(help="whole (squashed), centre, or ten.")]
+Batch = Annotated[int, typer.Option(min=1, help="Pictures encoded at a time.")]
+#: Options of commands that take pictures in a simulator.
+Width = Annotated[int, typer.Option(min=1, help="Width of the pictures in pixels.")]
+Height = Annotated[int, typer.Option(min=1, help="Height of the pictures.")]
 
 
 def check_target(target: Path, force: bool) -> None:
@@ -36,6 +65,16 @@ def say_next(target: Path) -> None:
         f"next: vusfa scenes show {target}; vusfa train preset=replay_search scenes=[{target}]",
         err=True,
     )
+
+
+def say_exported(scene: Scene, target: Path) -> None:
+    """Print what came out of a simulator, and the next commands."""
+    left_out, astray = (scene.attributes[key] for key in ("places_left_out", "moves_astray"))
+    typer.echo(
+        f"{target}: {scene.num_states} states; {left_out} places left out because the agent could not be put"
+        f" there, {astray} moves taken for blocked because they ended at no known pose"
+    )
+    say_next(target)
 
 
 def scene_path(source: str | Path) -> Path:

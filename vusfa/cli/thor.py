@@ -7,7 +7,18 @@ from typing import Annotated, Any
 
 import typer
 
-from vusfa.cli.sources import Force, check_target, say_next
+from vusfa.cli.sources import (
+    Batch,
+    Crops,
+    Force,
+    Height,
+    Layer,
+    Network,
+    Weights,
+    Width,
+    check_target,
+    say_exported,
+)
 
 __all__ = ["register"]
 
@@ -26,20 +37,18 @@ def export_thor(
     ],
     target: Annotated[Path, typer.Argument(help="File to write.", show_default=False)],
     grid: Annotated[float, typer.Option(min=0.05, help="Metres between places.")] = 0.5,
-    width: Annotated[int, typer.Option(min=1, help="Width of the pictures in pixels.")] = 400,
-    height: Annotated[int, typer.Option(min=1, help="Height of the pictures.")] = 300,
+    width: Width = 400,
+    height: Height = 300,
     field_of_view: Annotated[float, typer.Option(help="Vertical field of view in degrees.")] = 90,
     horizon: Annotated[float, typer.Option(help="Degrees by which the camera points down.")] = 0,
     headless: Annotated[
         bool, typer.Option("--headless", help="Render without a display (the simulator's CloudRendering).")
     ] = False,
-    backbone: Annotated[
-        str, typer.Option(help="Network that computes the features; see `vusfa scenes encode --help`.")
-    ] = "efficientnet-lite0",
-    weights: Annotated[Path | None, typer.Option(help="File of the network's weights.")] = None,
-    layer: Annotated[str | None, typer.Option(help="Layer whose output is taken, such as avgpool.")] = None,
-    crops: Annotated[str | None, typer.Option(help="whole (squashed), centre, or ten.")] = None,
-    batch: Annotated[int, typer.Option(min=1, help="Pictures encoded at a time.")] = 32,
+    backbone: Network = "efficientnet-lite0",
+    weights: Weights = None,
+    layer: Layer = None,
+    crops: Crops = None,
+    batch: Batch = 32,
     force: Force = False,
 ) -> None:
     """Make a scene from a live AI2-THOR 5 simulator (`pip install 'vusfa[thor]'`).
@@ -92,12 +101,7 @@ def export_thor(
             )
     finally:
         controller.stop()
-    left_out, astray = (room.attributes[key] for key in ("places_left_out", "moves_astray"))
-    typer.echo(
-        f"{target}: {room.num_states} states; {left_out} places left out because the agent could not be put"
-        f" there, {astray} moves taken for blocked because they ended at no known pose"
-    )
-    say_next(target)
+    say_exported(room, target)
 
 
 def _house(scene: str) -> dict[str, Any] | None:

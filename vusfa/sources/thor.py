@@ -4,8 +4,9 @@
 ``ai2thor.controller.Controller`` does (Kolve et al., arXiv 1712.05474); this module does not import ai2thor.
 It calls ``GetReachablePositions``, ``Teleport``, ``MoveAhead``, ``RotateRight``, ``RotateLeft`` and
 ``MoveBack``, and reads ``event.frame`` and, of ``event.metadata``, ``lastActionSuccess``, ``actionReturn``,
-``errorMessage`` and ``agent``. The simulator's build cannot be had everywhere: this package's tests drive the
-exporter with a stand-in controller that serves a bundled room through the same calls, not with the simulator.
+``errorMessage`` and ``agent``. AI2-THOR's build cannot be had everywhere: this package's tests drive the
+exporter with a stand-in controller that serves a bundled room through the same calls, and with another live
+simulator that answers them (:class:`vusfa.sources.miniworld.MiniWorldController`), not with AI2-THOR itself.
 
 The graph is measured, not derived from geometry: from every pose each action is taken once, and leads
 to the pose where the agent was found afterwards. The simulator's list of reachable positions is not trusted
@@ -61,6 +62,7 @@ def export(
     batch: int = 32,
     attributes: Mapping[str, Any] | None = None,
     versions: Mapping[str, str] | None = None,
+    origin: Provenance | None = None,
     visited: Callable[[int, int], None] | None = None,
     encoded: Callable[[int, int], None] | None = None,
 ) -> Scene:
@@ -78,7 +80,8 @@ def export(
         backbone: a network of :func:`vusfa.sources.backbones.load_backbone`, or its name.
         batch: pictures that are encoded at a time.
         attributes: further attributes on the origin.
-        versions: of the simulator, for ``made_with``.
+        versions: of the simulator, for ``made_with``; with others, an export begins anew.
+        origin: of another simulator's scene; AI2-THOR's by default.
         visited: called with poses visited and poses in all.
         encoded: called with pictures encoded and pictures in all.
 
@@ -113,7 +116,8 @@ def export(
         name,
         PoseGraph(graph, location, rotation, tuple(ACTIONS)),
         lambda first, last: np.concatenate([log.read(r, r + 1)["frame"] for r in rows[first:last]]),
-        Provenance(
+        origin
+        or Provenance(
             made_with=this_tool("scenes export-thor", **(versions or {})),
             made_on=today(),
             licences=("AI2-THOR: Apache License 2.0",),
