@@ -131,6 +131,45 @@ def test_many_rooms_fill_a_folder_and_a_second_run_does_the_rest(
     assert [name for name, _ in painted] == [f"bathroom-{seed}" for seed in (1, 2, 5, 2)]
 
 
+SPLIT = """\
+kinds: [bathroom, hall]
+parts: {train: {seeds: [1, 1], cells: 20}, test: {seeds: [3, 3], cells: 20}}
+width: 96
+samples: 1
+layer: _blocks.14
+grid: 3x4
+"""
+
+
+def test_the_rooms_of_a_split(
+    run: Callable[..., Any],
+    tmp_path: Path,
+    painted: list[tuple[str, Variation]],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Small pictures, which are not kept; the split is written beside the rooms."""
+    network: dict[str, Any] = {}
+    monkeypatch.setattr("vusfa.sources.backbones.load_backbone", lambda **how: network.update(how))
+    cameras = []
+    monkeypatch.setattr("vusfa.cli.render_rooms.with_camera", lambda plan, *how: cameras.append(how) or plan)
+    (tmp_path / "two.yaml").write_text(SPLIT)
+    result = run("render-rooms", tmp_path / "rooms", f"split={tmp_path / 'two.yaml'}")
+    assert result.exit_code == 0, result.stderr
+    assert [name for name, _ in painted] == ["bathroom-1", "hall-1", "bathroom-3", "hall-3"]
+    assert cameras == [(96, 1)] * 4
+    assert network["layer"] == "_blocks.14"
+    assert network["grid"] == (3, 4)
+    names = ["bathroom-1.h5", "bathroom-3.h5", "hall-1.h5", "hall-3.h5", "split.yaml"]
+    assert sorted(path.name for path in (tmp_path / "rooms").iterdir()) == names
+    assert not Scene.load(tmp_path / "rooms" / "hall-1.h5").has_pictures
+    again = run("render-rooms", tmp_path / "rooms", f"split={tmp_path / 'rooms' / 'split.yaml'}")
+    assert "4 of 4 files are there already" in again.stderr
+    for word in ("kind=[hall]", "seeds=1-2", "cells=20", "width=100", "vary=[dimmer]"):
+        refused = run("render-rooms", tmp_path / "rooms", "split=unseen", word)
+        assert "leave these and plan out" in refused.stderr
+    assert "is another split" in run("render-rooms", tmp_path / "rooms", "split=unseen").stderr
+
+
 def test_a_launcher_renders_rooms(
     run: Callable[..., Any],
     tmp_path: Path,

@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 import torch
 
@@ -33,10 +35,29 @@ def test_by_hand() -> None:
     assert walk == ["random", "–", "75.0", "37.5", "7.5", "–"]
 
 
+def test_other_rooms_have_a_table_of_their_own_and_other_names_rows() -> None:
+    """Searchers stand once, below the agents."""
+    runs = [cell(0, [5, 10, 200, 500]), cell(1, [5, 50, 20, 100]), cell(0, [5, 5, 5, 5])]
+    runs[2] = replace(runs[2], name="more-test-0", info={"tested_in": ["hall"], "part": "test"})
+    for run in runs:
+        run.episodes["shortest-path"] = cell(0, [5, 5, 5, 5]).episodes["agent"]
+    alone = replace(runs[1], info={"tested_in": ["attic"], "part": "large"}, name="vusfa-large-1")
+    first, second = unseen_table([*runs, alone]).split("\n\n**")
+    rows = [[part.strip() for part in line.split("|")[1:3]] for line in first.splitlines()[4:]]
+    assert first.startswith("**Tested in 1 rooms**")
+    assert rows == [["vusfa: agent", "2"], ["more: agent", "1"], ["shortest-path", "1"], ["random walk", "–"]]
+    assert second.startswith("Tested in 1 rooms (large)**")
+    assert [line.split("|")[1].strip() for line in second.splitlines()[4:]] == [
+        "agent",
+        "shortest-path",
+        "random walk",
+    ]
+
+
 def test_what_cannot_be_shown() -> None:
     with pytest.raises(ResultError, match="run it first"):
         unseen_table([])
     other = cell(1, [5, 5, 5, 5])
-    other.info["tested_in"][0] = "attic"
-    with pytest.raises(ResultError, match="different rooms"):
+    other.episodes["agent"].goal[0] = 4
+    with pytest.raises(ResultError, match="different goals"):
         unseen_table([cell(0, [5, 5, 5, 5]), other])

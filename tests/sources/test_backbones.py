@@ -15,7 +15,7 @@ from torch import nn
 
 from vusfa.errors import ConfigError
 from vusfa.files import file_sha256
-from vusfa.sources.backbones import LITE0_SHA256, Backbone, load_backbone
+from vusfa.sources.backbones import LITE0_SHA256, Backbone, load_backbone, parse_grid
 from vusfa.sources.crops import Preprocessing, prepare
 from vusfa.sources.encode import encode_pictures
 from vusfa.sources.layers import Patches
@@ -115,6 +115,38 @@ def test_torchvisions_pooled_layer(tiny: tuple[Tiny, Path], pictures: np.ndarray
     assert told["feature_weights_sha256"] == file_sha256(path)
     assert told["feature_crops"] == "centre"
     assert "centre crop of 20x20" in told["feature_preprocessing"]
+
+
+@pytest.mark.usefixtures("torchvision")
+def test_a_map_on_a_grid(tiny: tuple[Tiny, Path], pictures: np.ndarray) -> None:
+    """The mean over each part: rows of the map 0-4 and 4-8 (of nine), columns 0-2, 3-5 and 6-8."""
+    network, path = tiny
+    options: dict[str, Any] = {"weights": path, "layer": "conv1", "size": 20}
+    backbone = load_backbone("torchvision:tiny", **options, grid=(2, 3))
+    found = encode_pictures(pictures, backbone)[:, 0].reshape(3, 5, 2, 3)
+    with torch.no_grad():
+        maps = network.conv1(prepare(pictures, backbone.preprocessing))
+    assert maps.shape == (3, 5, 9, 9)
+    by_hand = [
+        [maps[:, :, rows, columns].mean((2, 3)) for columns in (slice(0, 3), slice(3, 6), slice(6, 9))]
+        for rows in (slice(0, 5), slice(4, 9))
+    ]
+    np.testing.assert_allclose(found, np.stack([np.stack(row, -1) for row in by_hand], -2), atol=1e-6)
+    assert backbone.attributes()["feature_grid"] == "2x3"
+    assert "conv1 on a grid of 2x3" in backbone.attributes()["feature"]
+    assert "feature_grid" not in load_backbone("torchvision:tiny", **options).attributes()
+    for layer, grid in (("conv1", (10, 1)), ("fc", (1, 1))):
+        small = load_backbone("torchvision:tiny", **{**options, "layer": layer}, grid=grid)
+        with pytest.raises(
+            ConfigError, match=f"{layer} gives shape .* no map of at least {grid[0]} x {grid[1]}"
+        ):
+            encode_pictures(pictures, small)
+
+
+@pytest.mark.parametrize("text", ["3", "3x", "0x4", "3x100", "3 x 4", "axb"])
+def test_what_is_no_grid(text: str) -> None:
+    with pytest.raises(ConfigError, match=f"grid is '{text}'; give rows and columns, such as 3x4"):
+        parse_grid(text)
 
 
 @pytest.mark.usefixtures("torchvision")
@@ -273,7 +305,10 @@ def test_what_is_missing_or_wrong_is_told(tmp_path: Path, tiny: tuple[Tiny, Path
         ),
         ({"name": str(tmp_path / "none.pt")}, "there is no such file"),
         ({"name": "efficientnet-lite0", "weights": tiny[1]}, "are no weights of efficientnet-lite0"),
-        ({"name": "efficientnet-lite0", "layer": "x"}, "layer is x, but this network has its own"),
+        (
+            {"name": "efficientnet-lite0", "layer": "x"},
+            "has no layer 'x'; at the top it has _conv",
+        ),
         ({"name": str(tmp_path)}, "has no config.json; give a folder that save_pretrained wrote"),
         ({"name": "efficientnet-lite0", "crops": "five"}, "crops is 'five'"),
     ]:

@@ -35,6 +35,14 @@ def test_features_are_rounded_and_all_else_is_kept(
     assert after.picture_shape == before.picture_shape
 
 
+def test_pictures_can_be_left_out(
+    make_file: Callable[..., Path], pictures: np.ndarray, tmp_path: Path
+) -> None:
+    compact(make_file(observation=pictures), tmp_path / "small.h5", pictures=False)
+    found = Scene.load(tmp_path / "small.h5")
+    assert (found.num_states, found.has_pictures) == (len(pictures), False)
+
+
 def test_raw_pictures_become_jpeg_files_that_look_the_same(
     make_file: Callable[..., Path], tmp_path: Path
 ) -> None:

@@ -18,16 +18,19 @@ def register(scenes: typer.Typer) -> None:
 
 
 def network_options(**options: Any) -> dict[str, Any]:
-    """Options as arguments of ``load_backbone``; "0.5,0.5,0.5" becomes three numbers.
+    """Options as arguments of ``load_backbone``; "0.5,0.5,0.5" becomes three numbers, "3x4" two.
 
     Raises:
-        ConfigError: mean or std is not three numbers.
+        ConfigError: mean or std is not three numbers, or the grid not two.
 
     >>> network_options(mean="0.5,0.5,0.5", size=None)
     {'mean': (0.5, 0.5, 0.5), 'size': None}
     """
     from vusfa.errors import ConfigError
+    from vusfa.sources.backbones import parse_grid
 
+    if options.get("grid") is not None:
+        options["grid"] = parse_grid(str(options["grid"]))
     for name in ("mean", "std"):
         if options.get(name) is not None:
             try:
@@ -56,6 +59,10 @@ def encode(
     layer: Annotated[
         str | None,
         typer.Option(help="Layer whose output is taken: pooled (the default), patches, or a name, avgpool."),
+    ] = None,
+    grid: Annotated[
+        str | None,
+        typer.Option(help="Average a map over parts of it, rows x columns: 3x4; by default over all."),
     ] = None,
     crops: Annotated[
         str | None, typer.Option(help="whole (squashed), centre, or ten; by default the network's own.")
@@ -91,6 +98,8 @@ def encode(
         vusfa scenes encode kitchen kitchen_dino.h5 --backbone dinov2-small/ --layer patches
 
         vusfa scenes encode room.h5 room_ten.h5 --crops ten --batch 8
+
+        vusfa scenes encode kitchen kitchen_map.h5 --layer _blocks.14 --grid 3x4
     """
     from vusfa.cli.resumed import resumed
     from vusfa.envs.scene_env import usable_device
@@ -100,7 +109,7 @@ def encode(
     path = scene_path(source)
     check_target(target, force)
     usable_device(device)  # before the pictures are read
-    options = network_options(crops=crops, size=size, resize=resize, mean=mean, std=std)
+    options = network_options(grid=grid, crops=crops, size=size, resize=resize, mean=mean, std=std)
     network = load_backbone(backbone, weights=weights, layer=layer, device=device, **options)
     with resumed("encoding", "pictures") as report:
         scene = encode_scene(path, target, network, batch=batch, bfloat16=bfloat16, progress=report)

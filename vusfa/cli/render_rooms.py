@@ -16,6 +16,7 @@ from vusfa.errors import ConfigError, VusfaError
 from vusfa.limits import brief
 
 if TYPE_CHECKING:
+    from vusfa.experiments.room_split import RoomSplit
     from vusfa.sources.backbones import Backbone
     from vusfa.sources.render import Rendered
     from vusfa.sources.render.plan import Plan
@@ -63,6 +64,18 @@ def _given(plan: Plan) -> Plan:
     return plan
 
 
+def _jobs_of(split: RoomSplit, folder: Path) -> Iterator[_Job]:
+    from vusfa.sources.render.kinds import programme
+    from vusfa.sources.render.layout import layout
+    from vusfa.sources.render.variation import PLAIN
+
+    for kind in split.kinds:
+        programme(kind)  # an unknown kind is an error before any work
+    for part in split.parts:
+        for kind, seed, cells in split.rooms(part):
+            yield _Job(folder / f"{kind}-{seed}.h5", partial(layout, kind, seed, cells), PLAIN)
+
+
 def _jobs(
     folder: Path, plans: list[Path], kinds: list[str], seeds: list[int], cells: int | None, vary: list[str]
 ) -> Iterator[_Job]:
@@ -95,6 +108,7 @@ def _render(
     samples: int | None,
     scalar: bool,
     threads: int | None,
+    pictures: bool = True,
 ) -> Rendered:
     from vusfa.sources.compact import compact
     from vusfa.sources.render.backend import Backend
@@ -110,7 +124,7 @@ def _render(
         threads=threads,
         variation=job.variation,
     )
-    compact(raw, job.target)
+    compact(raw, job.target, pictures)
     raw.unlink()
     return replace(rendered, path=job.target)
 
@@ -136,6 +150,13 @@ def render_rooms(
         list[str] | None,
         typer.Option(help="Changes of the pictures, as for `vusfa scenes render`; each gets a folder."),
     ] = None,
+    split: Annotated[
+        str | None,
+        typer.Option(
+            help="A split into rooms to train in and to test in, in place of the options above, width and"
+            " samples: unseen (docs/generalise.md), or a YAML file. Its pictures are not kept."
+        ),
+    ] = None,
     width: Width = None,
     samples: Samples = None,
     backbone: Network = "efficientnet-lite0",
@@ -160,15 +181,33 @@ def render_rooms(
         vusfa scenes render-rooms rooms/small kind=[bathroom,hall] seeds=1-60 cells=20
 
         vusfa scenes render-rooms robust plan=[bathroom,kitchen] vary=[dimmer,camera,all]
+
+        vusfa scenes render-rooms rooms/unseen split=unseen
     """
     from vusfa.cli.progress import progress
     from vusfa.files import check_folder
 
-    if bool(plan) == bool(kind):
-        raise ConfigError("say what to render: plan=[FILE,...], or kind=[KIND,...] with seeds=1-60")
-    if plan and (seeds or cells is not None):
-        raise ConfigError("seeds and cells belong to kind; a plan has both")
-    jobs = list(_jobs(folder, plan or [], kind or [], seed_numbers(seeds or ["1"]), cells, vary or []))
+    how: dict[str, Any] = {"width": width, "samples": samples, "scalar": scalar, "threads": threads}
+    network_of: dict[str, Any] = {"name": backbone, "weights": weights}
+    if split is not None:
+        from vusfa.experiments.room_split import read_split
+        from vusfa.sources.backbones import parse_grid
+
+        if plan or kind or seeds or vary or not cells is width is samples is None:
+            raise ConfigError("split has kinds, seeds, cells, width and samples; leave these and plan out")
+        rooms = read_split(split)
+        jobs = list(_jobs_of(rooms, folder))
+        how |= {"width": rooms.width, "samples": rooms.samples, "pictures": False}
+        network_of |= {"layer": rooms.layer, "grid": rooms.grid and parse_grid(rooms.grid)}
+        check_folder(folder.absolute(), "the folder of the rooms")
+        rooms.write(folder)
+    elif bool(plan) == bool(kind):
+        raise ConfigError("say what to render: plan=[FILE,...], or kind=[KIND,...] with seeds=1-60, or split")
+    else:
+        if plan and (seeds or cells is not None):
+            raise ConfigError("seeds and cells belong to kind; a plan has both")
+        numbers = seed_numbers(seeds or ["1"])
+        jobs = list(_jobs(folder, plan or [], kind or [], numbers, cells, vary or []))
     waiting = [job for job in jobs if not job.target.exists()]
     if len(waiting) < len(jobs):
         typer.echo(f"{len(jobs) - len(waiting)} of {len(jobs)} files are there already", err=True)
@@ -178,12 +217,11 @@ def render_rooms(
     from vusfa.sources.backbones import load_backbone
 
     check_folder(folder.absolute(), "the folder of the rooms")
-    how: dict[str, Any] = {"width": width, "samples": samples, "scalar": scalar, "threads": threads}
     if launcher != "serial" or launcher_options:
-        work = partial(_render, backbone=partial(load_backbone, backbone, weights=weights), **how)
+        work = partial(_render, backbone=partial(load_backbone, **network_of), **how)
         made = [Cell(job.target, partial(work, job)) for job in waiting]
         return run_cells(made, launcher, launcher_options or [])
-    network = load_backbone(backbone, weights=weights)
+    network = load_backbone(**network_of)
     failed: list[str] = []
     with progress("rendering", len(waiting), "rooms") as advance:
         for job in waiting:

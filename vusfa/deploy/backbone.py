@@ -9,13 +9,19 @@ from typing import Any
 from vusfa.errors import ConfigError
 from vusfa.limits import brief
 from vusfa.scenes import SceneSet
-from vusfa.sources.backbones import DEFAULT, Backbone, load_backbone
+from vusfa.sources.backbones import DEFAULT, POOLED_FEATURES, Backbone, load_backbone, parse_grid
 from vusfa.sources.crops import CROPS
 
 __all__ = ["find_backbone"]
 
 #: Attributes of a scene that must agree with the backbone's own.
-_RECORDED = ("feature_backbone", "feature_layer", "feature_weights_sha256", "feature_preprocessing")
+_RECORDED = (
+    "feature_backbone",
+    "feature_layer",
+    "feature_grid",
+    "feature_weights_sha256",
+    "feature_preprocessing",
+)
 #: The bundled rooms were written before these attributes existed.
 _OLD = "EfficientNet-lite0 extract_features mean over space; 224x224 bicubic resize"
 
@@ -57,15 +63,20 @@ def find_backbone(scenes: SceneSet, backbone: str | Backbone | None = None) -> B
                 f" yours; pass backbone=load_backbone({brief(known)}, weights=...) (backbone=NAME"
                 " weights=FILE of vusfa run and export)"
             )
-        crops = facts.get("feature_crops")
-        backbone = load_backbone(DEFAULT, crops=crops if crops in CROPS else None)
+        crops, layer, grid = (facts.get(f"feature_{key}") for key in ("crops", "layer", "grid"))
+        backbone = load_backbone(
+            DEFAULT,
+            layer=None if layer in (None, POOLED_FEATURES) else str(layer),
+            grid=None if grid is None else parse_grid(str(grid)),
+            crops=crops if crops in CROPS else None,
+        )
     found = load_backbone(backbone) if isinstance(backbone, str) else backbone
     own = found.attributes()
     for key in _RECORDED:
-        if key in facts and facts[key] != own[key]:
+        if key in facts and facts[key] != own.get(key):
             raise ConfigError(
                 f"scene {first!r} has features of {key.removeprefix('feature_')} {brief(facts[key])}, not"
-                f" {brief(own[key])}; pass the backbone that made them"
+                f" {brief(own.get(key))}; pass the backbone that made them"
             )
     if found.preprocessing.crops == "ten":  # agents read the first of the ten, the central one
         found = replace(found, preprocessing=replace(found.preprocessing, crops="centre"))

@@ -15,6 +15,7 @@ goal by standing at it; for one that recognizes it from afar, the bound is the s
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from heapq import heappop, heappush
 
@@ -174,12 +175,15 @@ def check_searched(scenes: SceneSet) -> None:
             )
 
 
-def evaluate_searchers(episodes: Episodes, scenes: SceneSet) -> dict[str, Episodes]:
+def evaluate_searchers(
+    episodes: Episodes, scenes: SceneSet, progress: Callable[[int, int], None] = lambda done, total: None
+) -> dict[str, Episodes]:
     """The same starts and goals for searchers that know the map, and for the shortest path.
 
     Args:
         episodes: of any policy.
         scenes: the world.
+        progress: called with the episodes done and their number.
 
     Returns:
         by mode, those of :data:`SEARCHERS`: a searcher that recognizes the goal by standing at it, and one
@@ -200,10 +204,14 @@ def evaluate_searchers(episodes: Episodes, scenes: SceneSet) -> dict[str, Episod
     """
     check_searched(scenes)
     times = {mode: torch.zeros_like(episodes.length) for mode in SEARCHERS[:3]}
+    done = 0
     for index in episodes.scene.unique().tolist():
         rows = episodes.scene == index
+        progress(done, len(episodes))
         for mode, table in zip(times, _tables(scenes.scenes[index]), strict=True):
             times[mode][rows] = table[episodes.start[rows], episodes.goal[rows]]
+        done += int(rows.sum())
+    progress(done, len(episodes))
     found = {}
     for mode, time in times.items():
         arrived = (time <= episodes.max_steps) & (episodes.shortest > 0)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import pandas as pd
 from torch import Tensor
@@ -10,6 +11,7 @@ from torch import Tensor
 from vusfa.errors import ResultError
 from vusfa.evaluation.baselines import RANDOM_WALK
 from vusfa.evaluation.long_table import goal_sums
+from vusfa.evaluation.searchers import SEARCHERS
 from vusfa.evaluation.statistics import Sums, bootstrap_mean, paired_difference
 from vusfa.experiments.runs import Run
 from vusfa.report.markdown import markdown
@@ -25,27 +27,64 @@ def unseen_table(runs: Sequence[Run]) -> str:
     minus that of the random walk, in percentage points; with 95 % bootstrap intervals over seeds and goals,
     goals drawn within their rooms.
 
+    Runs of several names (``name=`` of ``vusfa generalise``) are told apart by it; the searchers, which are
+    the same for all, stand once. Runs that were tested in different rooms have a table each.
+
     Args:
-        runs: one per seed, tested in the same rooms; their exact tables are the random walk's.
+        runs: one per name and seed; their exact tables are the random walk's.
 
     Raises:
-        ResultError: there are no runs, or they were tested in different rooms or without the random walk.
+        ResultError: there are no runs, or one of them was not tested beside the random walk.
     """
     if not runs or any(run.exact is None for run in runs):
         raise ResultError("there are no results of vusfa generalise; run it first")
-    if len({tuple(run.info["tested_in"]) for run in runs}) > 1:
-        raise ResultError("the runs were tested in different rooms; show those of one set of rooms")
+    groups: dict[tuple[str, ...], list[Run]] = {}
+    for run in runs:
+        groups.setdefault(tuple(run.info["tested_in"]), []).append(run)
+    if len(groups) == 1:
+        return _table(runs)
+    parts = []
+    for rooms, group in groups.items():
+        part = group[0].info.get("part")
+        head = f"Tested in {len(rooms)} rooms" + (f" ({part})" if part else "")
+        parts.append(f"**{head}**\n\n{_table(group)}")
+    return "\n\n".join(parts)
+
+
+def _table(runs: Sequence[Run]) -> str:
+    """Of runs that were tested in the same rooms."""
+    named: dict[str, list[Run]] = {}
+    for run in runs:
+        named.setdefault(_name(run), []).append(run)
+    rows: list[dict[str, Any]] = []
+    for name, group in named.items():
+        rows += _rows(group, f"{name}: " if len(named) > 1 else "")
+    last = [*SEARCHERS, RANDOM_WALK]
+    agents = [row for row in rows if row["policy"] not in last]
+    others = {row["policy"]: row for row in rows if row["policy"] in last}
+    shown = [*agents, *(others[policy] for policy in last if policy in others)]
+    return markdown(shown, ["policy", "seeds", *COMPARED, _GAP])
+
+
+def _rows(runs: Sequence[Run], prefix: str) -> list[dict[str, Any]]:
+    """Of runs of one name."""
     tables = [run.rows() for run in runs]
     baseline, scene = policy_sums(tables, "exact")
-    rows = []
+    rows: list[dict[str, Any]] = []
     for mode in runs[0].episodes:
         sums, _ = policy_sums(tables, mode)
         means = {name: bootstrap_mean(sums[name], scene) for name in COMPARED}
         gap = paired_difference(sums["success_100"], baseline["success_100"], scene)
-        rows.append({"policy": mode, "seeds": len(runs), **means, _GAP: gap})
+        policy = mode if mode in SEARCHERS else prefix + mode
+        rows.append({"policy": policy, "seeds": len(runs), **means, _GAP: gap})
     means = {name: bootstrap_mean(baseline[name], scene) for name in COMPARED}
-    rows.append({"policy": RANDOM_WALK, "seeds": None, **means})
-    return markdown(rows, ["policy", "seeds", *COMPARED, _GAP])
+    return [*rows, {"policy": RANDOM_WALK, "seeds": None, **means}]
+
+
+def _name(run: Run) -> str:
+    """Of the agent: that of the run without part and seed."""
+    name, part = run.name.rpartition("-")[0], run.info.get("part")
+    return name.removesuffix(f"-{part}") if part else name
 
 
 def policy_sums(tables: Sequence[pd.DataFrame], mode: str) -> tuple[dict[str, Sums], Tensor]:

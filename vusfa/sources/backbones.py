@@ -2,12 +2,15 @@
 
 | name | features | weights |
 |---|---|---|
-| ``efficientnet-lite0`` | 1280, pooled: the bundled rooms' | come with ``vusfa[encode]``, or a state dict |
+| ``efficientnet-lite0`` | 1280, pooled, or of ``layer`` | come with ``vusfa[encode]``, or a state dict |
 | ``timm:resnet50`` | pooled, ``patches``, or of another ``layer``; any of timm's models | a state dict |
 | ``torchvision:resnet50`` | of ``layer``; any of torchvision's models | a state dict |
 | a folder of transformers | ``pooled`` or ``patches``: DINOv2, CLIP, ViT and others | in the folder |
 | ``net.pt`` | the output of a TorchScript file | in the file |
 | ``net.onnx`` | the first output of an ONNX file, or that named by ``layer`` | in the file |
+
+A layer that gives a map is averaged over it, or, with ``grid``, over each part of it: the features then say
+where things are in the picture (``layer="_blocks.14", grid=(3, 4)`` of EfficientNet-lite0: 192 channels).
 
 Nothing is ever downloaded: weights are files that the user has. ``patches`` is the mean over the patch tokens
 of a vision transformer, without its class and register tokens. The paper's features are ResNet-50's pooled
@@ -21,6 +24,7 @@ their SHA-256 is :data:`LITE0_SHA256`.
 from __future__ import annotations
 
 import os
+import re
 import zipfile
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
@@ -30,19 +34,23 @@ from typing import Any
 
 import torch
 from torch import Tensor, nn
+from torch.nn.functional import adaptive_avg_pool2d
 
 from vusfa.errors import ConfigError
 from vusfa.files import file_sha256
-from vusfa.limits import one_line
+from vusfa.limits import brief, one_line
 from vusfa.reading import BoundedZip
 from vusfa.sources.crops import Preprocessing
 from vusfa.sources.layers import Features, Patches, UpTo
 from vusfa.sources.transformers_folder import PATCHES, POOLED, is_transformers_folder, open_folder
 
-__all__ = ["DEFAULT", "LITE0_SHA256", "Backbone", "load_backbone"]
+__all__ = ["DEFAULT", "LITE0_SHA256", "Backbone", "load_backbone", "parse_grid"]
 
 #: The network that made the bundled rooms' features.
 DEFAULT = "efficientnet-lite0"
+
+#: What the layer of features is called that were averaged over the last map.
+POOLED_FEATURES = "pooled features"
 
 #: SHA-256 of the weights that made the bundled rooms' features.
 LITE0_SHA256 = "579344248a93e23026e6b78f1f6faf0bc1d282386f6c881cdbaacd49cabf77db"
@@ -60,6 +68,8 @@ class Backbone:
         weights_sha256: SHA-256 of the weights.
         preprocessing: how its pictures are prepared.
         network: (n, 3, size, size) float32 to (n, F), or (n, F, h, w), which is then averaged over h and w.
+        grid: rows and columns (r, c) of the parts that a map is averaged over instead; the features are then
+            (F r c,), channel by channel and row by row.
         mixed: whether it can run in bfloat16.
         device: where it runs.
         weights_from: the file, folder or package that the weights were read from, with their license where
@@ -74,11 +84,15 @@ class Backbone:
     mixed: bool = True
     device: str = "cpu"
     weights_from: str = ""
+    grid: tuple[int, int] | None = None
 
     def attributes(self) -> dict[str, str]:
         """Provenance for a scene's attributes."""
+        parts = {} if self.grid is None else {"feature_grid": "{}x{}".format(*self.grid)}
+        where = "".join(f" on a grid of {text}" for text in parts.values())
         return {
-            "feature": f"{self.name} {self.layer}; {self.preprocessing.describe()}",
+            **parts,
+            "feature": f"{self.name} {self.layer}{where}; {self.preprocessing.describe()}",
             "feature_backbone": self.name,
             "feature_layer": self.layer,
             "feature_weights_sha256": self.weights_sha256,
@@ -91,7 +105,7 @@ class Backbone:
         """Features (n, F) float32 of prepared images (n, 3, size, size).
 
         Raises:
-            ConfigError: the layer gives neither a vector nor a map per image.
+            ConfigError: the layer gives neither a vector nor a map per image, or a map smaller than the grid.
         """
         with torch.autocast(torch.device(self.device).type, torch.bfloat16, enabled=bfloat16):
             found = self.network(images.to(self.device))
@@ -102,6 +116,14 @@ class Backbone:
                 f" choose a layer that gives (n, F) or (n, F, h, w)"
             )
         found = found.float()
+        if self.grid is not None:
+            rows, columns = self.grid
+            if found.ndim != 4 or found.shape[2] < rows or found.shape[3] < columns:
+                raise ConfigError(
+                    f"{self.name}: {self.layer} gives shape {tuple(found.shape[1:])} for an image, no map of"
+                    f" at least {rows} x {columns}; choose another layer or grid"
+                )
+            return adaptive_avg_pool2d(found, self.grid).flatten(1).cpu()
         return (found.mean((2, 3)) if found.ndim == 4 else found).cpu()
 
 
@@ -111,6 +133,7 @@ def load_backbone(
     weights: str | os.PathLike[str] | None = None,
     layer: str | None = None,
     device: str = "cpu",
+    grid: tuple[int, int] | None = None,
     **preprocessing: Any,
 ) -> Backbone:
     """A network by name, or from a file.
@@ -120,6 +143,7 @@ def load_backbone(
         weights: file of a state dict, for EfficientNet-lite0, timm's and torchvision's models.
         layer: dotted name of a layer, ``avgpool``; ``pooled`` or ``patches``; for ONNX the name of an output.
         device: where it runs.
+        grid: rows and columns of the parts of a map, see :class:`Backbone`.
         preprocessing: fields of :class:`vusfa.sources.crops.Preprocessing` that differ from the network's own
             (torchvision's and files': ImageNet's).
 
@@ -129,8 +153,7 @@ def load_backbone(
     name = os.fspath(name)
     library, _, model = name.partition(":")
     if name == DEFAULT:
-        _refuse(name, layer=layer)
-        backbone = _lite0(None if weights is None else Path(weights))
+        backbone = _lite0(None if weights is None else Path(weights), layer)
     elif is_transformers_folder(Path(name)):
         _refuse(name, weights=weights)
         library = _package("transformers", name, "'vusfa[transformers]'")
@@ -161,6 +184,7 @@ def load_backbone(
         backbone,
         preprocessing=replace(backbone.preprocessing, **options),
         device=device,
+        grid=grid,
         weights_from=backbone.weights_from or os.fspath(weights or name),
     )
     if isinstance(backbone.network, nn.Module):
@@ -217,7 +241,18 @@ def _check_records(path: Path) -> None:
                 raise ValueError("its records are longer than the file")
 
 
-def _lite0(path: Path | None) -> Backbone:
+def parse_grid(text: str) -> tuple[int, int]:
+    """Rows and columns of a grid, 1 to 99 each.
+
+    >>> parse_grid("3x4")
+    (3, 4)
+    """
+    if not (found := re.fullmatch(r"([1-9]\d?)x([1-9]\d?)", text)):
+        raise ConfigError(f"grid is {brief(text)}; give rows and columns, such as 3x4")
+    return int(found[1]), int(found[2])
+
+
+def _lite0(path: Path | None, layer: str | None) -> Backbone:
     install, origin = "'vusfa[encode]'", ""
     package = _package("efficientnet_lite_pytorch", DEFAULT, install)
     if path is None:
@@ -227,7 +262,8 @@ def _lite0(path: Path | None) -> Backbone:
     network = package.EfficientNet.from_name(DEFAULT)
     _load_weights(network, path, DEFAULT)
     digest = file_sha256(path)
-    return Backbone(DEFAULT, "pooled features", digest, _LITE0, Features(network), weights_from=origin)
+    answer = Features(network) if layer is None else UpTo(network, layer)
+    return Backbone(DEFAULT, layer or POOLED_FEATURES, digest, _LITE0, answer, weights_from=origin)
 
 
 def _torchvision(model: str, weights: Path, layer: str | None) -> Backbone:
@@ -270,7 +306,7 @@ def _timm(model: str, weights: Path, layer: str | None) -> Backbone:
         network = Patches(network)
     else:
         network = UpTo(network, layer)
-    return Backbone(name, layer or "pooled features", file_sha256(weights), preprocessing, network)
+    return Backbone(name, layer or POOLED_FEATURES, file_sha256(weights), preprocessing, network)
 
 
 def _torchscript(path: Path) -> Backbone:

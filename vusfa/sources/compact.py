@@ -16,11 +16,16 @@ from vusfa.scenes.validation import raise_faults
 __all__ = ["compact"]
 
 
-def compact(source: str | os.PathLike[str], target: str | os.PathLike[str]) -> None:
+def compact(source: str | os.PathLike[str], target: str | os.PathLike[str], pictures: bool = True) -> None:
     """A small copy of a scene file: features as float16, raw pictures as JPEG files of quality 92.
 
     Pictures that are JPEG files already are kept byte for byte. Rounding to float16 changes a feature by at
     most one part in 2048 (one below 6.1e-5 by at most 3e-8).
+
+    Args:
+        source: scene file.
+        target: file to write.
+        pictures: keep them, and datasets that are not those of a scene.
 
     Raises:
         SceneError: the source has faults, or a feature is beyond the range of float16, or the
@@ -39,15 +44,15 @@ def compact(source: str | os.PathLike[str], target: str | os.PathLike[str]) -> N
                 f" +-65504; scale the features down"
             )
     num_states, num_actions = dump.arrays["graph"].shape
-    pictures, blocks = picture_files.stored(source, num_states)
+    kept, blocks = picture_files.stored(source, num_states) if pictures else (None, None)
     if blocks is not None:
-        pictures = [picture_files.to_jpeg(picture) for block in blocks for picture in block]
+        kept = [picture_files.to_jpeg(picture) for block in blocks for picture in block]
     store.write(
         target,
         dump.arrays,
         name=dump.name,
         actions=dump.actions or default_actions(num_actions),
         attributes=dump.attributes,
-        pictures=pictures,
-        source=source,
+        pictures=kept,
+        source=source if pictures else None,
     )
