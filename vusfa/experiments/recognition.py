@@ -176,7 +176,9 @@ class _Constant(nn.Module):
 
 
 @torch.no_grad()
-def _test(probe: nn.Module, maps: Tensor, rooms: SceneSet, pairs: Sequence[Pairs], seed: int) -> list[Any]:
+def _test(
+    probe: nn.Module, maps: Tensor, rooms: SceneSet, pairs: Sequence[Pairs], seed: int
+) -> list[dict[str, Any]]:
     """Estimates by answer, of all pairs of two states and of those whose second place is in view."""
     generator = torch.Generator().manual_seed(seed + 1)
     sums: dict[tuple[str, str], list[tuple[Tensor, Tensor]]] = {}
@@ -186,11 +188,12 @@ def _test(probe: nn.Module, maps: Tensor, rooms: SceneSet, pairs: Sequence[Pairs
         parts = zip((maps[first + offset]).split(256), (maps[second + offset]).split(256), strict=True)
         answers = [probe(*part) for part in parts]
         found = scores({name: torch.cat([part[name] for part in answers]) for name in answers[0]}, asked)
-        for subset, rows in (("all", first != second), ("in view", (first != second) & asked["view"].bool())):
+        two = first != second
+        for subset, counted in (("all", two), ("in view", two & asked["view"].bool())):
             for name, values in found.items():
-                kept = values[rows & ~values.isnan()]
+                kept = values[counted & ~values.isnan()]
                 sums.setdefault((subset, name), []).append((kept.sum(), torch.tensor(float(len(kept)))))
-    rows = []
+    rows: list[dict[str, Any]] = []
     for subset in dict.fromkeys(subset for subset, _ in sums):
         row: dict[str, Any] = {"pairs": subset}
         for name, label in ANSWERS.items():
@@ -258,7 +261,7 @@ def recognition(
     how = {"steps": steps, "batch": batch, "lr": lr, "seed": seed}
     for kind in kinds:
         torch.manual_seed(seed)
-        probe = PairProbe(kind, *maps[0].shape[1:], sizes, hidden_size)
+        probe = PairProbe(kind, maps[0].shape[1], maps[0].shape[2], sizes, hidden_size)
         with ProgressLine(steps, unit=f"steps of the {kind} probe") as line:
             _train(probe, maps[0], worlds[0], pairs[0], how, line.update)
         probes[kind] = probe.eval()
