@@ -173,6 +173,15 @@ def test_dropout_of_features_is_drawn_for_every_step_and_evaluation_has_none(roo
     assert torch.equal(frames(trainer).lookup(None), table)
 
 
+def test_dropout_takes_its_share_and_the_others_make_up_for_it() -> None:
+    shown = FeatureFrames(torch.zeros(50, 1, 400))
+    shown.show(torch.ones(50, 400), dropout=0.2)
+    seen = shown.lookup(None)
+    assert set(seen.unique().tolist()) == {0.0, 1.25}
+    assert 0.18 < float((seen == 0).float().mean()) < 0.22  # seven standard deviations
+    assert not torch.equal(seen[0], seen[1])
+
+
 @pytest.mark.parametrize(
     ("overrides", "told"),
     [
