@@ -12,11 +12,13 @@ they are at that moment. Runs do not repeat number for number; a resumed run beg
 
 from __future__ import annotations
 
+import copy
 import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from functools import partial
 from multiprocessing.connection import Connection, wait
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -66,6 +68,9 @@ class HogwildTrainer(Trainer):
             )
         if next(self.agent.parameters()).device.type != "cpu":
             raise ConfigError(f"collector=hogwild needs device=cpu, not {settings['device']}")
+
+    def _content(self, folder: Path) -> dict[str, Any]:
+        return copy.deepcopy(super()._content(folder))  # workers move the weights while a file is written
 
     @contextmanager
     def collecting(self) -> Iterator[Iterator[Any]]:
