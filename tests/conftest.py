@@ -39,6 +39,11 @@ from vusfa.sources.render.catalogue import Catalogue
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
+# `pytest -n 2` keeps two cores busy with two processes. With a thread per core in each of them, torch's
+# threads wait for each other: the slowest test took 49 seconds in place of 4.
+if "PYTEST_XDIST_WORKER" in os.environ:
+    torch.set_num_threads(1)
+
 # An example takes longer on a busy machine: no property test has a deadline.
 hypothesis.settings.register_profile("vusfa", deadline=None)
 hypothesis.settings.load_profile("vusfa")

@@ -10,6 +10,7 @@ from tensordict import TensorDict
 
 from vusfa.algorithms import ExperienceGraph
 from vusfa.algorithms.experience import passing_weights
+from vusfa.algorithms.imitation import all_transitions
 from vusfa.envs import TargetNavEnv
 from vusfa.errors import ConfigError
 from vusfa.scenes import SceneSet
@@ -159,3 +160,37 @@ def test_a_damaged_state_is_refused(change, error: type[Exception], message: str
     with pytest.raises(error, match=message):
         other.load_state_dict(state)
     assert other.num_transitions == 0
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_labels_of_given_pairs(seed: int) -> None:
+    graph = random_graph(seed)
+    state, goal = torch.arange(12).repeat_interleave(12), torch.arange(12).repeat(12)
+    steps, best = graph.label(state.view(12, 12), goal.view(12, 12))
+    assert steps.shape == (12, 12)
+    assert best.shape == (12, 12, 3)
+    for s in range(12):
+        for g in range(12):
+            found = searched(graph, g) if graph.scene_of[g] >= 0 else {}
+            known = s in found and graph.scene_of[s] >= 0
+            assert steps[s, g] == (found[s] if known else 0)
+            marks = [
+                known and s != g and n >= 0 and found.get(int(n), 99) == found[s] - 1
+                for n in graph.successor[s]
+            ]
+            assert best[s, g].tolist() == marks
+
+
+def test_labels_of_two_scenes_and_of_goals_in_another() -> None:
+    scenes = SceneSet.bundled(["bathroom", "bedroom"])
+    graph = ExperienceGraph(scenes.num_states, scenes.num_actions)
+    graph.extend(all_transitions(scenes))
+    state, goal = torch.randint(580, (2, 200))
+    steps, best = graph.label(state, goal)
+    same = scenes.scene_id[state] == scenes.scene_id[goal]
+    assert bool((steps[~same] == 0).all())
+    assert not best[~same].any()
+    assert torch.equal(steps[same], scenes.distance(state[same], goal[same]).long().clamp(min=0))
+    for s, g, marks in zip(state[same].tolist(), goal[same].tolist(), best[same], strict=True):
+        ahead = scenes.distance(scenes.successor[s], torch.full((4,), g))
+        assert marks.tolist() == [s != g and int(d) == int(scenes.distance(s, g)) - 1 for d in ahead]

@@ -15,7 +15,8 @@ from torch import nn
 
 from vusfa.errors import ConfigError
 from vusfa.files import file_sha256
-from vusfa.sources.backbones import LITE0_SHA256, Backbone, load_backbone, parse_grid
+from vusfa.scenes.feature_grid import parse_grid
+from vusfa.sources.backbones import LITE0_SHA256, Backbone, load_backbone
 from vusfa.sources.crops import Preprocessing, prepare
 from vusfa.sources.encode import encode_pictures
 from vusfa.sources.layers import Patches

@@ -159,12 +159,10 @@ def test_an_agent_that_is_handed_features_is_evaluated_on_the_first_crop(room: P
     assert not torch.equal(drawn["goal_observation"], first)
 
 
-def test_dropout_of_features_is_drawn_for_every_step_and_evaluation_has_none(room: Path) -> None:
+def test_dropout_of_features_is_drawn_for_every_look_up_and_evaluation_has_none(room: Path) -> None:
     trainer = made(room, "env.crop_dropout=0.5")
     table = frames(trainer).lookup(None).clone()
-    trainer.algorithm.show_crops()
     one = frames(trainer).lookup(None).clone()
-    trainer.algorithm.show_crops()
     other = frames(trainer).lookup(None)
     assert torch.allclose(one, torch.where(one == 0, 0.0, 2 * table))
     assert 0.3 < float((one == 0).float().mean()) < 0.7
@@ -174,8 +172,8 @@ def test_dropout_of_features_is_drawn_for_every_step_and_evaluation_has_none(roo
 
 
 def test_dropout_takes_its_share_and_the_others_make_up_for_it() -> None:
-    shown = FeatureFrames(torch.zeros(50, 1, 400))
-    shown.show(torch.ones(50, 400), dropout=0.2)
+    shown = FeatureFrames(torch.ones(50, 1, 400))
+    shown.dropout = 0.2
     seen = shown.lookup(None)
     assert set(seen.unique().tolist()) == {0.0, 1.25}
     assert 0.18 < float((seen == 0).float().mean()) < 0.22  # seven standard deviations
@@ -189,7 +187,7 @@ def test_dropout_takes_its_share_and_the_others_make_up_for_it() -> None:
         (["env.crop_dropout=nan"], r"env.crop_dropout is nan; give a number from 0 to below 1"),
         (
             ["env.crop_dropout=0.5", "agent.observation=features"],
-            "env.crop_dropout is 0.5: only an agent that reads",
+            "env.crop_dropout is 0.5: only an agent that looks features up",
         ),
     ],
 )

@@ -1,7 +1,7 @@
 """Algorithms: the losses of a batch, of replay, and what follows a step; a registry of them.
 
->>> sorted(ALGORITHMS)
-['autoencoder', 'contrastive', 'forward_backward', 'hindsight', 'implicit_q', 'replay_search', 'usf']
+>>> ", ".join(sorted(ALGORITHMS))
+'autoencoder, contrastive, forward_backward, hindsight, imitation, implicit_q, replay_search, usf'
 """
 
 from vusfa.algorithms.autoencoder import Autoencoder
@@ -12,6 +12,7 @@ from vusfa.algorithms.forward_backward import ForwardBackward
 from vusfa.algorithms.goal_learning import GoalLearning, GoalLearningSettings
 from vusfa.algorithms.hindsight import Hindsight
 from vusfa.algorithms.hindsight_goals import HindsightSampler
+from vusfa.algorithms.imitation import Imitation
 from vusfa.algorithms.implicit_q import ImplicitQ
 from vusfa.algorithms.registry import (
     ALGORITHMS,
@@ -41,6 +42,7 @@ __all__ = [
     "Hindsight",
     "HindsightReplay",
     "HindsightSampler",
+    "Imitation",
     "ImplicitQ",
     "ReplaySearch",
     "annealed",

@@ -59,6 +59,13 @@ class Algorithm:
     def __init__(self, agent: Agent, scenes: SceneSet, settings: Mapping[str, Any]) -> None:
         self.agent, self.scenes, self.settings = agent, scenes, settings
         self.threads = threads_per_step(settings)
+        if (frames := self._feature_frames()) is not None:
+            frames.dropout = settings["env"].get("crop_dropout", 0.0)
+
+    def _feature_frames(self) -> FeatureFrames | None:
+        """Where an agent that reads ids looks features up; None for any other."""
+        frames = getattr(getattr(self.agent, "encoder", None), "frames", None)  # an extension may have none
+        return frames if isinstance(frames, FeatureFrames) and frames.num_states else None
 
     def parameters(self) -> Iterable[nn.Parameter]:
         """What the optimizer moves: the agent's parameters, and those of networks of its own."""
@@ -70,21 +77,17 @@ class Algorithm:
 
     def show_crops(self) -> None:
         """Show an agent that reads ids other crops than the first, as ``env.crop`` says: in training mode it
-        sees every state, as state and as goal, in that crop, or in one drawn anew at each call, without a
-        share ``env.crop_dropout`` of its features, which each call draws anew, too.
+        sees every state, as state and as goal, in that crop, or in one drawn anew at each call.
 
         Agents that are handed features get theirs from :class:`~vusfa.envs.SceneObservation`.
         """
-        task = self.settings["env"]
-        crop, dropout = crop_index(task["crop"], self.scenes.num_crops), task.get("crop_dropout", 0.0)
-        frames = getattr(getattr(self.agent, "encoder", None), "frames", None)  # an extension may have none
-        shown = crop != 0 or dropout
-        if not shown or not isinstance(frames, FeatureFrames) or not frames.num_states:
+        crop, frames = crop_index(self.settings["env"]["crop"], self.scenes.num_crops), self._feature_frames()
+        if crop == 0 or frames is None:
             return
         features = self.scenes.features
         number, crops = features.shape[:2]
         drawn = torch.randint(crops, (number,)) if crop is None else torch.full((number,), crop)
-        frames.show(features[torch.arange(number), drawn], dropout)
+        frames.show(features[torch.arange(number), drawn])
 
     def schedule(self, frames: int) -> None:
         """Set what depends on the number of frames trained on, such as a coefficient."""

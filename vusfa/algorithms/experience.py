@@ -15,6 +15,10 @@ from vusfa.scenes.paths import ShortestPaths
 __all__ = ["ExperienceGraph", "merge_graphs", "passing_weights"]
 
 
+#: Seen states of a scene up to which all its shortest paths are computed at once, not goal by goal.
+TABULATED = 256
+
+
 def passing_weights(distance: Tensor) -> Tensor:
     r"""Weight of each state, so that states are drawn as walks to the goal from uniform starts pass them.
 
@@ -119,6 +123,8 @@ class ExperienceGraph:
             following = self.successor[states]
             place = torch.where(following < 0, -1, torch.searchsorted(states, following))
             self._scenes[scene] = states, place, ShortestPaths(place.numpy())
+            if len(states) <= TABULATED:
+                _ = self._scenes[scene][2].table
         return self._scenes[scene]
 
     def sample(self, num_goals: int, batch_size: int, path_share: float = 0.5) -> TensorDict:
@@ -160,6 +166,32 @@ class ExperienceGraph:
                 )
         columns = {name: torch.cat([part[name] for part in parts]) for name in parts[0]}
         return TensorDict(columns, [len(columns["goal_id"])])
+
+    def label(self, state: Tensor, goal: Tensor) -> tuple[Tensor, Tensor]:
+        r"""Shortest known paths of given pairs.
+
+        Args:
+            state, goal: (\*B,) int64.
+
+        Returns:
+            their length, (\*B,) int64, 0 where none is known or the state is the goal; and the first steps of
+            all of them, (\*B, A) bool.
+        """
+        rows, ends = state.reshape(-1).cpu(), goal.reshape(-1).cpu()
+        steps = torch.zeros_like(rows)
+        best = torch.zeros(len(rows), self.successor.shape[1], dtype=torch.bool)
+        scene = torch.where(self.scene_of[rows] == self.scene_of[ends], self.scene_of[ends], -1)
+        for number in scene[scene >= 0].unique().tolist():
+            row = (scene == number).nonzero().squeeze(-1)
+            states, place, paths = self._scene(number)
+            here, there = (torch.searchsorted(states, ids[row]) for ids in (rows, ends))
+            steps[row] = length = paths.between(here, there).clamp(min=0)
+            following = place[here]
+            ahead = paths.between(following.clamp(min=0).flatten(), there.repeat_interleave(best.shape[1]))
+            ahead = ahead.view_as(following)
+            known = (following >= 0) & (ahead >= 0)
+            best[row] = known & (ahead == length.unsqueeze(-1) - 1)
+        return steps.view(state.shape), best.view(*state.shape, -1)
 
     def state_dict(self) -> dict[str, Any]:
         """Transitions and scenes of states."""

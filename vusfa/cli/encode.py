@@ -27,7 +27,7 @@ def network_options(**options: Any) -> dict[str, Any]:
     {'mean': (0.5, 0.5, 0.5), 'size': None}
     """
     from vusfa.errors import ConfigError
-    from vusfa.sources.backbones import parse_grid
+    from vusfa.scenes.feature_grid import parse_grid
 
     if options.get("grid") is not None:
         options["grid"] = parse_grid(str(options["grid"]))

@@ -191,7 +191,7 @@ def render_rooms(
     network_of: dict[str, Any] = {"name": backbone, "weights": weights}
     if split is not None:
         from vusfa.experiments.room_split import read_split
-        from vusfa.sources.backbones import parse_grid
+        from vusfa.scenes.feature_grid import parse_grid
 
         if plan or kind or seeds or vary or not cells is width is samples is None:
             raise ConfigError("split has kinds, seeds, cells, width and samples; leave these and plan out")

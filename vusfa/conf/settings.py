@@ -96,7 +96,9 @@ class AgentSettings:
     shared_encoder: bool | None
     embedding_layer: bool | None
     state_layer: bool | None
+    fusion: str | None
     memory: str | None
+    previous_action: bool | None
     shared_heads: bool | None
     pretrained: str | None
     successor_norm: str | None

@@ -9,7 +9,8 @@ from typing import Any
 from vusfa.errors import ConfigError
 from vusfa.limits import brief
 from vusfa.scenes import SceneSet
-from vusfa.sources.backbones import DEFAULT, POOLED_FEATURES, Backbone, load_backbone, parse_grid
+from vusfa.scenes.feature_grid import parse_grid
+from vusfa.sources.backbones import DEFAULT, POOLED_FEATURES, Backbone, load_backbone
 from vusfa.sources.crops import CROPS
 
 __all__ = ["find_backbone"]

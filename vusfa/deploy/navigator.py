@@ -146,6 +146,7 @@ class Navigator:
         """Begin a new walk towards the same goal: forget the pictures seen."""
         self._history: list[Tensor] = []
         self._memory: dict[Any, Tensor] = {}
+        self._before = 0
         self.probabilities, self.similarity = None, None
 
     def goal(self, picture: Any) -> str:
@@ -195,6 +196,7 @@ class Navigator:
         observation, features = self._observe(self._picture(picture)[0])
         kept = self.agent.config["history"]
         started = bool(self._history)
+        before = self._before if started else len(self.actions)
         self._history = [*(self._history or [observation] * (kept - 1)), observation][-kept:]
         rows = TensorDict(
             {
@@ -202,6 +204,7 @@ class Navigator:
                 "goal_observation": self._goal[0][None],
                 "scene_id": torch.tensor([self.scenes.scene_index(self.scene)]),
                 "is_init": torch.tensor([[not started]]),
+                "previous_action": torch.tensor([before]),
             },
             [1],
         )
@@ -215,6 +218,7 @@ class Navigator:
             index = int(torch.multinomial(probabilities, 1, generator=self._generator))
         else:
             index = int(probabilities.argmax())
+        self._before = index
         self.similarity = self.places.similarity(features, self._goal[1]).item()
         arrived = self.similarity >= self.threshold
         return Action(self.actions[index], index, probabilities[index].item(), arrived)

@@ -64,7 +64,7 @@ def evaluate(
         episodes_per_goal: episodes per goal, from starts drawn uniformly.
         max_steps: limit of actions per episode.
         history: frames H in ``state_id``.
-        sample: sample actions from the policy, or take the most probable one.
+        sample: draw actions, or take the most probable one.
         unreachable: see :func:`episode_starts`.
         seed: of starts and actions.
         batch_size: episodes in parallel.
@@ -73,7 +73,7 @@ def evaluate(
         by_scene: walk in a few scenes at a time, as always where features stay in files.
 
     Raises:
-        ConfigError: the policy's agent was made for other scenes.
+        ConfigError: the agent was made for other scenes.
         GoalError: a goal does not exist, or no goal can be reached.
     """
     check_evaluation(policy, scenes, history, batch_size, seed)
@@ -160,7 +160,7 @@ def walk(
     """Roll out one episode per pair of start and goal, with the present exploration type and random state.
 
     A policy with memory writes its next state under ``("next", key)`` and finds it again under ``key``;
-    ``is_init`` (n, 1) marks the rows that begin.
+    ``is_init`` (n, 1) marks the rows that begin, ``previous_action`` (n,) is A in these.
 
     Args:
         policy, scenes, max_steps, history, batch_size, observe, progress: see :func:`evaluate`.
@@ -168,14 +168,12 @@ def walk(
         visited: gets, per step, the episodes that moved and their new states.
 
     Returns:
-        success (n,) bool, length (n,) int64, collisions (n,) int64 and last state (n,) int64, a global id; on
-        the CPU.
+        success (n,) bool; length, collisions and last state, a global id, (n,) int64 each; on the CPU.
     """
     if max_steps < 1 or batch_size < 1:
         raise ConfigError(f"max_steps is {max_steps} and batch_size {batch_size}; both must be 1 or more")
-    device = scenes.successor.device
+    device, total = scenes.successor.device, len(start)
     start, goal = start.to(device), goal.to(device)
-    total = start.shape[0]
     success = torch.zeros(total, dtype=torch.bool, device=device)
     length = torch.full((total,), max_steps, dtype=torch.int64, device=device)
     collisions = torch.zeros(total, dtype=torch.int64, device=device)
@@ -188,6 +186,7 @@ def walk(
     steps = torch.zeros(begun, 1, dtype=torch.int64, device=device)
     frames = start_history(start[row], history)
     memory: dict[tuple[str, ...], Tensor] = {}
+    before = torch.full_like(row, scenes.num_actions)
     while row.numel():
         batch = TensorDict(
             {"state_id": frames, "goal_id": goal[row], "scene_id": scenes.scene_id[goal[row]]},
@@ -196,9 +195,9 @@ def walk(
         )
         for key, value in memory.items():
             batch.set(key, value)
-        batch.set("is_init", steps == 0)
+        batch.set("is_init", steps == 0).set("previous_action", before)
         batch = policy(batch if observe is None else observe(batch))
-        action = batch.get("action")
+        before = action = batch.get("action")
         end = step(scenes.successor, scenes.blocked, rewards, max_steps, frames, goal[row], steps, action)
         frames, steps = end.state_id, end.elapsed_steps
         success[row] = end.terminated.squeeze(-1)
@@ -216,6 +215,7 @@ def walk(
             row = torch.cat([row[walking], new])
             steps = torch.cat([steps[walking], steps.new_zeros(new.shape[0], 1)])
             frames = torch.cat([frames[walking], start_history(start[new], history)])
+            before = torch.cat([action[walking], torch.full_like(new, scenes.num_actions)])
             memory = {
                 key: torch.cat([value[walking], value.new_zeros(new.shape[0], *value.shape[1:])])
                 for key, value in memory.items()

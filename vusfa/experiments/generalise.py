@@ -88,11 +88,10 @@ def rooms_of(
 def policies(agent: Any, scenes: SceneSet, weight: float, temperature: float) -> dict[str, Any]:
     """Who walks in the rooms, by name."""
     sizes = scenes.num_states, scenes.num_actions
-    return {
-        "agent": InferencePolicy(agent),
-        "agent-memory": TriedActions(agent, *sizes, weight=weight, temperature=temperature),
-        "memory": TriedActions(None, *sizes, weight=weight),
-    }
+    walkers: dict[str, Any] = {"agent": InferencePolicy(agent)}
+    if agent.memory is None:  # one that remembers by itself needs no count of tried actions
+        walkers["agent-memory"] = TriedActions(agent, *sizes, weight=weight, temperature=temperature)
+    return walkers | {"memory": TriedActions(None, *sizes, weight=weight)}
 
 
 def generalise(

@@ -18,9 +18,9 @@ from vusfa.errors import ConfigError
 from vusfa.evaluation.long_table import DISTANCE_BINS
 from vusfa.evaluation.statistics import Estimate, Sums, bootstrap_mean
 from vusfa.experiments.generalise import rooms_of
-from vusfa.limits import brief
 from vusfa.modules.pair_probe import PROBES, PairProbe
 from vusfa.scenes import Scene, SceneSet
+from vusfa.scenes.feature_grid import feature_grid
 from vusfa.scenes.views import places_in_view
 from vusfa.training.progress import ProgressLine
 
@@ -37,21 +37,12 @@ ROOMS_AT_ONCE = 16
 def feature_maps(scenes: SceneSet) -> Tensor:
     """Features (S, T, C) of the first crop of all states as maps of T parts, T = 1 for pooled ones.
 
-    The scenes' attribute ``feature_grid`` says how many parts there are.
-
     Raises:
-        ConfigError: it is not the same in all of them, or does not divide the features.
+        ConfigError: see :func:`~vusfa.scenes.feature_grid.feature_grid`.
     """
-    grids = {str(scene.attributes.get("feature_grid", "1x1")) for scene in scenes.scenes}
-    sides = [int(side) for side in sorted(grids)[0].split("x") if side.isdigit()]
-    parts = sides[0] * sides[-1] if len(sides) == 2 else 0
-    if len(grids) > 1 or not parts or scenes.feature_size % parts:
-        raise ConfigError(
-            f"the rooms have {scenes.feature_size} features on grids of {brief(sorted(grids))}; give rooms"
-            " with one feature_grid, as vusfa scenes encode grid=3x4 writes it"
-        )
+    rows, columns = feature_grid(scenes)
     flat = torch.cat([scene.features[:, 0] for scene in scenes.scenes])
-    return flat.view(len(flat), -1, parts).transpose(1, 2)
+    return flat.view(len(flat), -1, rows * columns).transpose(1, 2)
 
 
 class Pairs:

@@ -12,12 +12,14 @@ from vusfa.modules.agents import Agent, make_agent
 from vusfa.modules.autoencoder import explained_features, pretrain_autoencoder
 from vusfa.modules.bottleneck import GaussianBottleneck, LatentSampler, gaussian_kl
 from vusfa.modules.config import ARCHITECTURES, MODELS, AgentConfig, Model, register_model, resolve_config
+from vusfa.modules.correlation import CorrelationTrunk, PartCorrelation
 from vusfa.modules.draws import action_probs, draw, draw_actions
 from vusfa.modules.episodic import TriedActions
 from vusfa.modules.frames import FeatureFrames, PictureFrames
 from vusfa.modules.inference import InferencePolicy, TabularPolicy
 from vusfa.modules.linear import HistoryLinear, SceneLinear
 from vusfa.modules.policy import PolicyHead, SuccessorPolicyHead
+from vusfa.modules.previous_action import ActionInput, PreviousAction
 from vusfa.modules.siamese import SiameseEncoder
 from vusfa.modules.successor import RewardHead, SuccessorHead, SuccessorValue, ValueHead
 from vusfa.modules.transplanting import transplant
@@ -28,8 +30,10 @@ from vusfa.modules.upgrade import upgrade_agent_config, upgrade_agent_state
 __all__ = [
     "ARCHITECTURES",
     "MODELS",
+    "ActionInput",
     "Agent",
     "AgentConfig",
+    "CorrelationTrunk",
     "FeatureFrames",
     "Fusion",
     "GaussianBottleneck",
@@ -37,8 +41,10 @@ __all__ = [
     "InferencePolicy",
     "LatentSampler",
     "Model",
+    "PartCorrelation",
     "PictureFrames",
     "PolicyHead",
+    "PreviousAction",
     "RewardHead",
     "SceneLayer",
     "SceneLinear",

@@ -22,10 +22,12 @@ from vusfa.deprecated import moved_names
 from vusfa.errors import ConfigError
 from vusfa.modules.bottleneck import GaussianBottleneck, LatentSampler
 from vusfa.modules.config import AgentConfig, resolve_config
+from vusfa.modules.correlation import CorrelationTrunk, make_correlation
 from vusfa.modules.frames import FeatureFrames, PictureFrames, picture_table
 from vusfa.modules.policy import PolicyHead, SuccessorPolicyHead
+from vusfa.modules.previous_action import ActionInput, PreviousAction
 from vusfa.modules.siamese import SiameseEncoder
-from vusfa.modules.steps import Actor, Observing, Remembering, Step
+from vusfa.modules.steps import Actor, Moved, Observing, Remembering, Step
 from vusfa.modules.successor import RewardHead, SuccessorHead, SuccessorValue, ValueHead
 from vusfa.modules.trunk import Fusion, SceneLayer, SiameseTrunk
 from vusfa.scenes import Home, check_scenes
@@ -110,10 +112,12 @@ class Agent(nn.Module):
         self.encoder = self.make_encoder(config, scenes)
         self.encoder.requires_grad_(config.pretrained is None)
         self.fusion = Fusion(config.embedding_size, hidden)
+        self.correlation = make_correlation(scenes, hidden) if config.fusion == "correlation" else None
         self.scene_layer = SceneLayer(self.num_scenes, hidden, hidden)
         self.latent = LatentSampler(config.eval_latent) if config.ideas.bottleneck else None
         self.successor, self.reward, self.value = self.make_value(config)
         self.policy: nn.Module = self.make_policy(config, scenes.num_actions)
+        self.action_input = ActionInput(scenes.num_actions, hidden) if config.previous_action else None
         self.memory = nn.LSTM(hidden, hidden, batch_first=True) if config.memory == "lstm" else None
         self._steps = self.make_steps(config)  # a plain dict: the layers are children under the names above
         self.home = _home(self.config, scenes)
@@ -187,11 +191,17 @@ class Agent(nn.Module):
         )
         gaussian = ["state_loc", "state_scale", "state_kl", "goal_loc", "goal_scale", "goal_kl"]
         written = ["state_embedding", "goal_embedding", *(gaussian if self.latent else []), "fused"]
-        steps: dict[str, Step] = {"trunk": Observing(SiameseTrunk(self.encoder, self.fusion), read, written)}
+        trunk = SiameseTrunk(self.encoder, self.fusion)
+        if self.correlation is not None:
+            trunk = CorrelationTrunk(self.encoder, self.fusion, self.correlation)
+        steps: dict[str, Step] = {"trunk": Observing(trunk, read, written)}
         fused = "fused"
+        if self.action_input is not None:
+            steps["action_input"] = Moved(self.action_input, [fused, "previous_action"], ["acted"])
+            fused = "acted"
         if self.memory is not None:
+            steps["memory"] = Remembering(lstm=self.memory, in_key=fused, out_key="remembered")
             fused = "remembered"
-            steps["memory"] = Remembering(lstm=self.memory, in_key="fused", out_key=fused)
         steps["scene_layer"] = Step(self.scene_layer, [fused, "scene_id"], ["hidden"])
         if self.successor is not None:
             steps["successor"] = Step(self.successor, ["hidden", "scene_id"], ["successor_features"])
@@ -247,13 +257,15 @@ class Agent(nn.Module):
         return TensorDictSequential(*self.critic_steps())
 
     def make_env_transforms(self) -> list[Transform]:
-        """What an environment must add to its observations: nothing, or an LSTM's start marks and state."""
+        """What an environment must add to its observations: nothing, or an LSTM's start marks and state, and
+        the action before where the agent reads it."""
         if self.memory is None:
             return []
         dtype = next(self.memory.parameters()).dtype
         shape = (self.memory.num_layers, self.memory.hidden_size)
         states = {key: Unbounded(shape, dtype=dtype) for key in self._steps["memory"].in_keys[1:3]}
-        return [InitTracker(), TensorDictPrimer(states, expand_specs=True)]
+        acted = [] if self.action_input is None else [PreviousAction(self.config["num_actions"])]
+        return [InitTracker(), TensorDictPrimer(states, expand_specs=True), *acted]
 
 
 def _home(config: dict[str, Any], scenes: Any) -> Home:

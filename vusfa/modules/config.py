@@ -75,6 +75,8 @@ _OURS_ALONE = (
     "initial_scale",
     "shared_heads",
     "pretrained",
+    "fusion",
+    "previous_action",
 )
 
 
@@ -95,7 +97,10 @@ class AgentConfig:
         normalize_features: bring each feature to mean 0, deviation 1 over the scenes' states.
         normalize_embedding, shared_encoder, state_layer: see :class:`~vusfa.modules.SiameseEncoder`.
         embedding_layer: a linear layer behind the encoder's first; without it E must equal ``hidden_size``.
+        fusion: ``"concatenation"`` of the embeddings of state and goal, or ``"correlation"``: the features'
+            parts are compared, too (:class:`~vusfa.modules.PartCorrelation`).
         memory: ``"lstm"``: a recurrent layer behind the fusion of state and goal.
+        previous_action: it also reads the action before (:class:`~vusfa.modules.PreviousAction`).
         shared_heads: all scenes share the weights behind the fusion, and which scene it is is not read;
             :func:`~vusfa.modules.transplant` takes such an agent to other scenes.
         pretrained: ``"autoencoder"``: constant encoder of :func:`~vusfa.modules.pretrain_autoencoder`.
@@ -121,7 +126,9 @@ class AgentConfig:
     shared_encoder: bool = True
     embedding_layer: bool = True
     state_layer: bool = False
+    fusion: Literal["concatenation", "correlation"] = "concatenation"
     memory: Literal["lstm"] | None = None
+    previous_action: bool = False
     shared_heads: bool = False
     pretrained: Literal["autoencoder"] | None = None
     successor_norm: Literal["layer"] | None = None
@@ -204,6 +211,7 @@ def _checked(config: AgentConfig) -> AgentConfig:
     for name, choices in (
         ("observation", ("index", "features", "pixels")),
         ("encoder", ("mlp", "conv")),
+        ("fusion", ("concatenation", "correlation")),
         ("memory", (None, "lstm")),
         ("pretrained", (None, "autoencoder")),
         ("successor_norm", (None, "layer")),
@@ -231,6 +239,15 @@ def _checked(config: AgentConfig) -> AgentConfig:
     if config.encoder == "conv" and config.normalize_features:
         raise ConfigError(
             "normalize_features is for precomputed features; the conv encoder has none, leave it out"
+        )
+    if config.fusion == "correlation" and config.encoder == "conv":
+        raise ConfigError(
+            "fusion='correlation' compares parts of precomputed features; the conv encoder has none, leave it"
+            " out"
+        )
+    if config.previous_action and config.memory is None:
+        raise ConfigError(
+            "previous_action is for an agent that remembers; give memory='lstm', or leave it out"
         )
     if config.pretrained and (config.encoder, config.observation) != ("mlp", "index"):
         raise ConfigError(

@@ -42,7 +42,7 @@ class FeatureFrames(_Frames):
     """Precomputed features of frames: a table of all states that stays out of the ``state_dict``.
 
     The table holds crop 0, in evaluation mode always; :meth:`show` puts other crops in its place for
-    training.
+    training, and :attr:`dropout` hides some of what is looked up.
 
     Args:
         features: (S, C, F) float32 of all states, as in ``SceneSet.features``. Of a lazily opened set the
@@ -52,6 +52,10 @@ class FeatureFrames(_Frames):
             part of the ``state_dict``, because the weights behind them mean nothing with others. They are
             those of crop 0. A feature that is the same in all states stays near 0, with a warning that names
             it.
+
+    Attributes:
+        dropout: probability with which a feature that is looked up in training mode is 0, its mean with
+            ``normalize``; the others grow by 1 / (1 - dropout). Each look-up draws anew.
 
     Raises:
         ConfigError: ``normalize``, and no feature changes at all.
@@ -66,6 +70,7 @@ class FeatureFrames(_Frames):
     deviation: Tensor
     _converted: Tensor | None
     _shown: Tensor | None = None
+    dropout: float = 0.0
 
     def __init__(self, features: Tensor | LazyFeatures, lookup: bool = True, normalize: bool = False) -> None:
         super().__init__()
@@ -95,6 +100,14 @@ class FeatureFrames(_Frames):
 
         Under autocast the table is converted once, because it is constant.
         """
+        found = self._found(ids)
+        if not (self.dropout and self.training):
+            return found
+        # torch.dropout draws from a Bernoulli distribution, which takes three times as long
+        kept = torch.rand_like(found) >= self.dropout
+        return found * kept / (1 - self.dropout)
+
+    def _found(self, ids: Tensor | None) -> Tensor:
         if self._rows is not None:
             return for_autocast(self._rows(self._all(ids), self._read))
         table, device = self.table, self.table.device.type
@@ -111,14 +124,12 @@ class FeatureFrames(_Frames):
         assert self._features is not None
         return self.encode(self._features.of_scene(scene)[:, 0].to(self.table.device))
 
-    def show(self, features: Tensor | None, dropout: float = 0.0) -> None:
+    def show(self, features: Tensor | None) -> None:
         """Look up other features in training mode; evaluation mode looks up crop 0.
 
         Args:
             features: (S, F) of all states, as the scenes have them, such as a crop of each drawn at random;
                 None: crop 0 again.
-            dropout: probability with which a feature of a state is 0, its mean with ``normalize``; the others
-                grow by 1 / (1 - dropout).
 
         >>> frames = FeatureFrames(torch.zeros(3, 2, 8))
         >>> frames.show(torch.ones(3, 8))
@@ -126,10 +137,6 @@ class FeatureFrames(_Frames):
         (tensor(8.), tensor(0.))
         """
         self._shown = None if features is None else self.encode(features.to(self.table.device))
-        if self._shown is not None and dropout:
-            # torch.dropout draws from a Bernoulli distribution, which takes three times as long
-            kept = torch.rand_like(self._shown) >= dropout
-            self._shown = self._shown * kept / (1 - dropout)
         self._converted = None
 
     def train(self, mode: bool = True) -> FeatureFrames:

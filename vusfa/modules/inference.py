@@ -1,9 +1,8 @@
 """Inference-only policies: the actor's actions, without the tensors that only a loss reads.
 
 With few rows per step, moving what a loss may read about costs as much as the matrix products do.
-:class:`InferencePolicy` runs the actor's own layers on plain tensors. While weights are constant
-(:meth:`InferencePolicy.cached`), what depends on single frames is computed once, and an agent that sees one
-frame by its id becomes a table (:class:`TabularPolicy`). Nothing else is kept from call to call.
+:class:`InferencePolicy` runs the actor's layers on plain tensors. While weights are constant, what depends on
+single frames is computed once, and an agent that sees one frame by its id becomes a :class:`TabularPolicy`.
 """
 
 from __future__ import annotations
@@ -27,7 +26,7 @@ from vusfa.modules.precision import autocast_copy
 from vusfa.modules.rows import RowScenes, SceneBlocks, SortedByScene
 from vusfa.modules.steps import AtHome
 from vusfa.modules.tables import states_around, table_pays
-from vusfa.modules.trunk import CachedTrunk, SiameseTrunk, remember
+from vusfa.modules.trunk import SiameseTrunk, remember
 from vusfa.modules.unique import shapes_may_vary
 from vusfa.scenes import SceneSet, check_home
 
@@ -70,9 +69,11 @@ class InferencePolicy(AtHome, TensorDictModuleBase):
         super().__init__()
         self.agent = agent
         trunk, *heads = agent.actor_steps()
-        memory = None if agent.memory is None else heads[0]
-        self._memory_keys = [] if memory is None else memory.in_keys[1:]
-        self._written_keys = [] if memory is None else memory.out_keys[1:]
+        before = [] if agent.action_input is None else ["previous_action"]
+        self._remembering = len(before) + (agent.memory is not None)
+        memory = heads[len(before) : self._remembering]
+        self._memory_keys = [*before, *(key for step in memory for key in step.in_keys[1:])]
+        self._written_keys = [key for step in memory for key in step.out_keys[1:]]
         self.in_keys = [*trunk.in_keys, "scene_id", *self._memory_keys]
         self.out_keys = ["action", *self._written_keys]
         read = {key for step in heads for key in step.in_keys}
@@ -97,8 +98,7 @@ class InferencePolicy(AtHome, TensorDictModuleBase):
             scenes: the agent's world. An agent that sees one frame is then tabulated, where the table has at
                 most three times as many entries as ``rows``.
             rows: expected number of rows; None for many.
-            states: (n,) ids of the only states to come, ascending; where ``scenes`` are given, those of the
-                goals' scenes.
+            states: (n,) ids of the only states to come, ascending; found where ``scenes`` are given.
         """
         before = self._layers, self._table
         check_home(self, scenes)
@@ -115,11 +115,11 @@ class InferencePolicy(AtHome, TensorDictModuleBase):
 
     def _cached_layers(self, goals: Tensor | None, rows: int | None, states: Tensor | None) -> _Layers:
         trunk, *heads = self._modules_run()
-        memory = [] if self.agent.memory is None else [heads.pop(0)]
+        first, last = heads[: self._remembering], heads[self._remembering :]
         if self._whole or not trunk.encoder.by_id or self._computes_frames(rows):
-            trunk, *heads = autocast_copy([trunk, *heads])
-            return _Layers(trunk if self._whole else trunk.fused, [*memory, *heads])
-        return _Layers(CachedTrunk(trunk, goals, rows, states).fused, [*memory, *autocast_copy(heads)])
+            trunk, *last = autocast_copy([trunk, *last])
+            return _Layers(trunk if self._whole else trunk.fused, [*first, *last])
+        return _Layers(trunk.cached(goals, rows, states).fused, [*first, *autocast_copy(last)])
 
     def _computes_frames(self, rows: int | None) -> bool:
         """Whether frames are learned, and so few are asked for that not all should be computed."""
@@ -166,19 +166,18 @@ class InferencePolicy(AtHome, TensorDictModuleBase):
         if self._table:
             return self._table[0](tensordict)
         state, goal, scene, *memory = (tensordict.get(key, None) for key in self.in_keys)
-        if state is None or goal is None or scene is None:
+        others = dict(zip(self._memory_keys, memory, strict=True))
+        marks = (others.get(key, scene) for key in ("is_init", "previous_action"))
+        if any(entry is None for entry in (state, goal, scene, *marks)):
             raise ConfigError(
-                f"the policy reads {self.in_keys}, and some of these are missing; TargetNavEnv sends ids, and"
-                " the transform vusfa.envs.SceneObservation adds observations"
+                f"the policy reads {self.in_keys}, some are missing; TargetNavEnv sends ids, the transform"
+                " vusfa.envs.SceneObservation observations, agent.make_env_transforms() what a memory reads"
             )
         batch = scene.dim()
         rows = state.reshape(-1, *state.shape[batch:]), goal.reshape(-1, *goal.shape[batch:])
         if not memory:
             actions = draw_actions(self._by_scene(*rows, scene.reshape(-1)), interaction_type())
             return tensordict.set("action", actions.view(scene.shape))
-        if memory[-1] is None:
-            raise ConfigError("the policy reads 'is_init'; give the environment agent.make_env_transforms()")
-        others = dict(zip(self._memory_keys, memory, strict=True))
         others = {key: None if x is None else x.reshape(-1, *x.shape[batch:]) for key, x in others.items()}
         values = self._run(*rows, {"scene_id": scene.reshape(-1), **others})
         for key in self._written_keys:

@@ -11,7 +11,7 @@ from torchrl.modules import LSTMModule
 from vusfa.errors import ConfigError
 from vusfa.scenes import check_home
 
-__all__ = ["Actor", "AtHome", "Observing", "Remembering", "Step"]
+__all__ = ["Actor", "AtHome", "Moved", "Observing", "Remembering", "Step"]
 
 
 class AtHome:
@@ -46,6 +46,12 @@ class Observing(_SaysWhatIsMissing, Step):
         "TargetNavEnv sends ids; for an agent with observation='features' or 'pixels' append the transform"
         " vusfa.envs.SceneObservation(scenes, kind) to it"
     )
+
+
+class Moved(_SaysWhatIsMissing, Step):
+    """The step that reads the action before."""
+
+    mend = "give the environment the transforms of agent.make_env_transforms()"
 
 
 class Remembering(_SaysWhatIsMissing, LSTMModule):

@@ -84,6 +84,12 @@ class SiameseTrunk(nn.Module):
             self.encoder.check_ids(state, goal)
             raise
 
+    def cached(
+        self, goals: Tensor | None = None, rows: int | None = None, states: Tensor | None = None
+    ) -> Any:
+        """An object with :meth:`fused` for constant weights; arguments of :class:`CachedTrunk`."""
+        return CachedTrunk(self, goals, rows, states)
+
     def _fused(self, state: Tensor, goal: Tensor) -> Tensor:
         states, goals = self.encoder.first_layer(state, goal)
         state_part = gather(self.fusion.state_part(self.encoder.embed_state(states.values)), states.inverse)
@@ -120,7 +126,7 @@ class CachedTrunk:
     ) -> None:
         encoder, fusion = trunk.encoder, trunk.fusion
         features, first = encoder.frames.lookup(states), encoder.branch.first
-        self.place = None if states is None else _inverse(states, encoder.frames.num_states)
+        self.place = None if states is None else inverse_index(states, encoder.frames.num_states)
         (self.trunk,) = autocast_copy([trunk])
         self.known: Tensor | None = None  # (S, H) bool, the entries of ``frames`` that are computed
         # one frame: (S, 1, hidden), per state; more: (S, H, hidden), per frame and place
@@ -137,7 +143,7 @@ class CachedTrunk:
             self.frames = first.project(features)
         self.row: Tensor | None = None
         if goals is not None:
-            self.row = _inverse(goals.to(features.device), encoder.frames.num_states)
+            self.row = inverse_index(goals.to(features.device), encoder.frames.num_states)
             features = encoder.frames.lookup(goals)
         goal_first = (encoder.goal_branch or encoder.branch).first.repeated(features)
         self.goals = fusion.goal_part(encoder.embed_goal(goal_first))  # (G, hidden)
@@ -177,7 +183,7 @@ class CachedTrunk:
             known[new, place] = True
 
 
-def _inverse(ids: Tensor, number: int) -> Tensor:
+def inverse_index(ids: Tensor, number: int) -> Tensor:
     """Place (number,) of every id among ``ids``; -1, with which every look-up fails, for the others."""
     place = torch.full((number,), -1, dtype=torch.int64, device=ids.device)
     place[ids] = torch.arange(len(ids), device=ids.device)

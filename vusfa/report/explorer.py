@@ -209,4 +209,5 @@ def _standing(
 ) -> Any:
     batch = _batch(scenes, start_history(state, history), goal)
     batch.set("is_init", torch.ones_like(state, dtype=torch.bool).unsqueeze(-1))
+    batch.set("previous_action", torch.full_like(state, scenes.num_actions))
     return batch if observe is None else observe(batch)

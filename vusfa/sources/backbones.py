@@ -24,7 +24,6 @@ their SHA-256 is :data:`LITE0_SHA256`.
 from __future__ import annotations
 
 import os
-import re
 import zipfile
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
@@ -38,13 +37,13 @@ from torch.nn.functional import adaptive_avg_pool2d
 
 from vusfa.errors import ConfigError
 from vusfa.files import file_sha256
-from vusfa.limits import brief, one_line
+from vusfa.limits import one_line
 from vusfa.reading import BoundedZip
 from vusfa.sources.crops import Preprocessing
 from vusfa.sources.layers import Features, Patches, UpTo
 from vusfa.sources.transformers_folder import PATCHES, POOLED, is_transformers_folder, open_folder
 
-__all__ = ["DEFAULT", "LITE0_SHA256", "Backbone", "load_backbone", "parse_grid"]
+__all__ = ["DEFAULT", "LITE0_SHA256", "Backbone", "load_backbone"]
 
 #: The network that made the bundled rooms' features.
 DEFAULT = "efficientnet-lite0"
@@ -239,17 +238,6 @@ def _check_records(path: Path) -> None:
         with BoundedZip(path) as archive:
             if sum(record.file_size for record in archive.infolist()) > path.stat().st_size:
                 raise ValueError("its records are longer than the file")
-
-
-def parse_grid(text: str) -> tuple[int, int]:
-    """Rows and columns of a grid, 1 to 99 each.
-
-    >>> parse_grid("3x4")
-    (3, 4)
-    """
-    if not (found := re.fullmatch(r"([1-9]\d?)x([1-9]\d?)", text)):
-        raise ConfigError(f"grid is {brief(text)}; give rows and columns, such as 3x4")
-    return int(found[1]), int(found[2])
 
 
 def _lite0(path: Path | None, layer: str | None) -> Backbone:

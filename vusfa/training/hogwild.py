@@ -69,8 +69,10 @@ class HogwildTrainer(Trainer):
         if next(self.agent.parameters()).device.type != "cpu":
             raise ConfigError(f"collector=hogwild needs device=cpu, not {settings['device']}")
 
-    def _content(self, folder: Path) -> dict[str, Any]:
-        return copy.deepcopy(super()._content(folder))  # workers move the weights while a file is written
+    def _content(self, folder: Path, merged: Mapping[str, Any]) -> dict[str, Any]:
+        return copy.deepcopy(
+            super()._content(folder, merged)
+        )  # workers move the weights while a file is written
 
     @contextmanager
     def collecting(self) -> Iterator[Iterator[Any]]:

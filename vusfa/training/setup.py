@@ -86,11 +86,9 @@ def make_trainer(
     crop, dropout = task.pop("crop"), task.pop("crop_dropout", 0.0)
     if not 0 <= dropout < 1:
         raise ConfigError(f"env.crop_dropout is {dropout}; give a number from 0 to below 1")
-    if dropout and (
-        scenes.is_lazy or (agent.config["observation"], agent.config["encoder"]) != ("index", "mlp")
-    ):
+    if dropout and (agent.config["observation"], agent.config["encoder"]) != ("index", "mlp"):
         raise ConfigError(
-            f"env.crop_dropout is {dropout}: only an agent that reads ids of scenes in memory sees it; give 0"
+            f"env.crop_dropout is {dropout}: only an agent that looks features up by ids sees it; give 0"
         )
     observation = make_observation(agent, scenes, crop)
     transforms = [*([observation] if observation is not None else []), *agent.make_env_transforms()]

@@ -226,11 +226,11 @@ class Trainer:
             }
             merged = self.ranks.merge(own, self.algorithm.merge_states)
             if self.ranks.is_first:
-                save_checkpoint(path, self._content(Path(path).parent) | merged)
+                save_checkpoint(path, self._content(Path(path).parent, merged))
             return Path(path)
 
-    def _content(self, folder: Path) -> dict[str, Any]:
-        return {
+    def _content(self, folder: Path, merged: Mapping[str, Any]) -> dict[str, Any]:
+        return dict(merged) | {
             "frames": self.frames,
             "updates": self.updates,
             "seconds": self.seconds,
