@@ -9,9 +9,9 @@ import pytest
 import torch
 from omegaconf import OmegaConf
 
-from vusfa.algorithms.imitation import all_transitions
+from vusfa.algorithms.imitation import EXPERTS, all_transitions
 from vusfa.cli.launch import compose
-from vusfa.errors import ConfigError
+from vusfa.errors import CheckpointError, ConfigError
 from vusfa.evaluation import evaluate
 from vusfa.modules import InferencePolicy
 from vusfa.scenes import SceneSet
@@ -83,26 +83,45 @@ def test_models_learn_what_is_theirs_besides(scene_file: Path, model: str) -> No
         assert float(terms["loss_successor"]) > 0.0
 
 
-def test_it_resumes(scene_file: Path, tmp_path: Path) -> None:
+def test_own_transitions_are_labels_too(scene_file: Path) -> None:
+    """At first few paths are known; of a scene that is walked whole, as many as its graph has."""
+    one = trainer(scene_file, "algorithm.expert=experience", "agent.model=gvf", "collector.num_envs=4")
+    expert = one.algorithm.expert  # type: ignore[attr-defined]
+    assert expert.num_transitions == 0
+    with one.collecting() as batches:
+        one.update(batches)
+        assert 0 < expert.num_transitions < 64
+        for _ in range(50):
+            batch = one.update(batches)[0]
+    assert expert.num_transitions == 64
+    state, goal = batch["state_id"][..., -1], batch["goal_id"]
+    assert torch.equal(expert.label(state, goal)[0], one.scenes.distance(state, goal).long())
+
+
+@pytest.mark.parametrize("expert", EXPERTS)
+def test_it_resumes(scene_file: Path, tmp_path: Path, expert: str) -> None:
     """Number for number what an uninterrupted training computes."""
     runs = []
     for stops in (False, True):
         torch.manual_seed(0)
-        one = trainer(scene_file)
+        one = trainer(scene_file, f"algorithm.expert={expert}")
         with one.collecting() as batches:
             one.update(batches)
             path = one.save(tmp_path / "a.pt")
             if not stops:
                 one.update(batches)
         if stops:
-            one = trainer(scene_file)
+            one = trainer(scene_file, f"algorithm.expert={expert}")
             one.resume(path)
             with one.collecting() as batches:
                 one.update(batches)
         runs.append(one)
     for name, weight in runs[0].agent.state_dict().items():
         assert torch.equal(weight, runs[1].agent.state_dict()[name]), name
-    assert load_checkpoint(path)["config"]["algorithm"]["name"] == "imitation"
+    assert ("experience" in load_checkpoint(path)["algorithm"]) == (expert == "experience")
+    if expert == "scenes":
+        with pytest.raises(CheckpointError, match="without a graph of own transitions; give expert=scenes"):
+            trainer(scene_file, "algorithm.expert=experience").resume(path)
 
 
 @pytest.mark.parametrize(
@@ -112,6 +131,7 @@ def test_it_resumes(scene_file: Path, tmp_path: Path) -> None:
         (["objective.critic_coeff=0.5"], "give objective.critic_coeff=0, and algorithm.critic_coeff"),
         (["optim=a3c"], "algorithm=imitation knows no threads, .*; give optim=adam"),
         (["algorithm.minibatches=3"], "minibatches is 3, which does not divide collector.num_envs=64"),
+        (["algorithm.expert=teacher"], "algorithm.expert is 'teacher'"),
         (["algorithm.minibatches=0"], "minibatches is 0"),
     ],
 )

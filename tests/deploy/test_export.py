@@ -152,4 +152,7 @@ def test_what_cannot_be_exported_is_said_before_any_work(world: Any, tmp_path: P
     navigator.backbone = replace(world.backbone, network=lambda images: images)
     with pytest.raises(ConfigError, match="backbone patches is a file of a finished network"):
         export_onnx(navigator, out)
+    remembering = Navigator.load(world.checkpoint(memory="lstm", previous_action=True), **options)
+    with pytest.raises(ConfigError, match="an ONNX file is not told the action before"):
+        export_onnx(remembering, out)
     assert not out.exists()

@@ -59,21 +59,25 @@ def test_pictures_of_the_dump_give_the_actions_that_its_states_give(
         assert found.confidence == pytest.approx(row.max().item(), abs=1e-5)
 
 
-def test_an_agent_with_a_memory_remembers_until_it_is_reset(world: Any) -> None:
-    path = world.checkpoint(memory="lstm")
+@pytest.mark.parametrize("acted", [False, True], ids=["pictures", "and actions"])
+def test_an_agent_with_a_memory_remembers_until_it_is_reset(world: Any, acted: bool) -> None:
+    path = world.checkpoint(memory="lstm", previous_action=acted)
     navigator, (agent, scenes, _) = navigate(world, path, sample=False), load_agent(path, world.scenes)
     actor = agent.get_policy_operator(["logits"])
     navigator.goal(scenes.pictures(5))
     for begin in (0, 1):
         memory: dict[Any, Any] = {}
+        before = 4
         for number, state in enumerate([1, 1, 9][begin:]):
             rows = TensorDict({"state_id": torch.tensor([[state]]), "goal_id": torch.tensor([5])}, [1])
             rows["scene_id"], rows["is_init"] = torch.tensor([0]), torch.tensor([[number == 0]])
             rows.update(memory)
+            rows["previous_action"] = torch.tensor([before])
             rows = actor(rows)
             memory = {key: rows["next", key] for key in ("recurrent_state_h", "recurrent_state_c")}
             found = navigator.act(scenes.pictures(state))
             assert found.confidence == pytest.approx(rows["logits"].softmax(-1).max().item(), abs=1e-5)
+            before = found.index
         navigator.reset()
 
 

@@ -12,15 +12,18 @@ from torch import Tensor
 from torchrl.modules import set_recurrent_mode
 
 from vusfa.algorithms.base import AlgorithmSettings
-from vusfa.algorithms.experience import ExperienceGraph
+from vusfa.algorithms.experience import ExperienceGraph, merge_graphs
 from vusfa.algorithms.registry import register_algorithm
 from vusfa.algorithms.usf import USF
-from vusfa.errors import ConfigError
+from vusfa.errors import CheckpointError, ConfigError, near
 from vusfa.modules import Agent
 from vusfa.objectives.search import SearchLoss
 from vusfa.scenes import SceneSet
 
-__all__ = ["Imitation", "ImitationSettings"]
+__all__ = ["EXPERTS", "Imitation", "ImitationSettings"]
+
+#: Whose shortest paths are learned.
+EXPERTS = ("scenes", "experience")
 
 
 @dataclass
@@ -28,10 +31,13 @@ class ImitationSettings(AlgorithmSettings):
     """Numbers of ``algorithm=imitation``.
 
     Attributes:
+        expert: whose shortest paths are learned: ``"scenes"``, those of the scenes' graphs; ``"experience"``,
+            those in the graph of the agent's own transitions so far, for which no graph is read.
         minibatches: parts of a batch, each with an optimizer step; sequences of the collector stay whole.
         critic_coeff, objective_coeff: of :class:`~vusfa.objectives.SearchLoss`.
     """
 
+    expert: str = "scenes"
     minibatches: int = 4
     critic_coeff: float = 1.0
     objective_coeff: float = 1.0
@@ -42,9 +48,10 @@ class Imitation(USF):
     """DAgger (Ross et al. 2011, https://arxiv.org/abs/1011.0686): the agent walks by its own policy, and in
     every state that it comes to it learns what an expert would do there.
 
-    The expert knows the graphs of the scenes that are trained in: :class:`~vusfa.objectives.SearchLoss`
-    learns all first steps of shortest paths, and their length. No reward is needed; what a model learns
-    besides, by ``objective.successor_coeff`` and ``objective.bottleneck_coeff``, is that of
+    The expert knows the graphs of the scenes that are trained in, or an
+    :class:`~vusfa.algorithms.ExperienceGraph` of the agent's own transitions. Of its shortest paths
+    :class:`~vusfa.objectives.SearchLoss` learns all first steps, and the length. No reward is needed; what a
+    model learns besides, by ``objective.successor_coeff`` and ``objective.bottleneck_coeff``, is that of
     :class:`~vusfa.algorithms.USF`. Any agent can be trained, one with a memory, too.
     """
 
@@ -68,8 +75,14 @@ class Imitation(USF):
             raise ConfigError(
                 f"algorithm.minibatches is {self._parts}, which does not divide collector.num_envs={rows}"
             )
+        if numbers["expert"] not in EXPERTS:
+            raise ConfigError(
+                f"algorithm.expert is {numbers['expert']!r}; {near(numbers['expert'], EXPERTS)}"
+            )
+        self._learns_graph = numbers["expert"] == "experience"
         self.expert = ExperienceGraph(scenes.num_states, scenes.num_actions)
-        self.expert.extend(all_transitions(scenes))
+        if not self._learns_graph:
+            self.expert.extend(all_transitions(scenes))
         options = {name: numbers[name] for name in ("critic_coeff", "objective_coeff")}
         options |= {name: settings["env"][name] for name in ("goal_reward", "step_reward")}
         networks = agent.get_policy_operator(), agent.get_value_operator()
@@ -84,7 +97,9 @@ class Imitation(USF):
         self.has_more = agent.successor is not None or bool(self.terms)
 
     def minibatches(self, batch: TensorDictBase) -> Sequence[TensorDictBase]:
-        """Parts of the environments."""
+        """Parts of the environments; a graph of own transitions has the batch by then."""
+        if self._learns_graph:
+            self.expert.extend(batch)
         return batch.split(len(batch) // self._parts)
 
     def losses(self, batch: TensorDictBase) -> dict[str, Tensor]:
@@ -98,6 +113,24 @@ class Imitation(USF):
             torch.clear_autocast_cache()
             terms |= super().losses(batch)
         return terms
+
+    def state_dict(self) -> dict[str, Any]:
+        """The loss's buffers, and a graph of own transitions."""
+        own = {"experience": self.expert.state_dict()} if self._learns_graph else {}
+        return {**super().state_dict(), **own}
+
+    def merge_states(self, states: Sequence[dict[str, Any]]) -> dict[str, Any]:
+        """With the transitions of all ranks, which each gets when it resumes."""
+        graphs = [state["experience"] for state in states if state is not None and "experience" in state]
+        return {**states[0], "experience": merge_graphs(graphs)} if graphs else states[0]
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Continue with the graph; a ``CheckpointError`` where it is missing."""
+        super().load_state_dict(state)
+        if self._learns_graph:
+            if not state.get("experience"):
+                raise CheckpointError("of a training without a graph of own transitions; give expert=scenes")
+            self.expert.load_state_dict(state["experience"])
 
 
 def all_transitions(scenes: SceneSet) -> TensorDict:

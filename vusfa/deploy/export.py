@@ -61,7 +61,7 @@ def export_onnx(navigator: Navigator, path: str | os.PathLike[str]) -> Path:
         path: the file to write, replaced if it exists.
 
     Raises:
-        ConfigError: the backbone cannot be exported, packages are missing, or the folder cannot be written.
+        ConfigError: agent or backbone cannot be exported, packages are missing, the folder cannot be written.
 
     >>> from vusfa.deploy import Navigator
     >>> export_onnx(Navigator.load("run/checkpoint.pt"), "agent.onnx")  # doctest: +SKIP
@@ -71,7 +71,7 @@ def export_onnx(navigator: Navigator, path: str | os.PathLike[str]) -> Path:
     check_folder(path.parent, "the ONNX file's folder")
     if path.is_dir():
         raise ConfigError(f"{path}: is a folder; give the name of a file, such as agent.onnx")
-    _refuse_finished_networks(navigator)
+    _refuse(navigator)
     for package in ("onnx", "onnxscript"):
         _package(package)
     onnx = import_module("onnx")
@@ -128,7 +128,13 @@ def _kept(navigator: Navigator, batch: int) -> dict[str, Tensor]:
     return {"started": torch.zeros(batch, dtype=torch.bool), **kept} if kept else {}
 
 
-def _refuse_finished_networks(navigator: Navigator) -> None:
+def _refuse(navigator: Navigator) -> None:
+    """What cannot become an ONNX file."""
+    if navigator.agent.action_input is not None:
+        raise ConfigError(
+            "agent.previous_action is true: an ONNX file is not told the action before; walk with"
+            " vusfa.deploy.Navigator, or export an agent without it"
+        )
     if navigator.backbone is None:
         return
     network = navigator.backbone.network

@@ -10,6 +10,7 @@ from vusfa.experiments.runs import read_runs
 from vusfa.files import check_file, check_folder, write_csv
 from vusfa.report.experiment import Experiment, read_experiment
 from vusfa.report.generated import write_documents
+from vusfa.report.growth_plot import draw_growth
 from vusfa.report.markdown import flat_rows, markdown
 from vusfa.report.result_tables import (
     columns,
@@ -51,7 +52,8 @@ def print_tables(
         results: their folder.
         out: folder for the CSV files; RESULTS/tables when not given.
         docs: write the tables that the documentation shows to this folder (docs/generated), and print none.
-        plot: draw success to trained and to unseen goals as PNG.
+        plot: draw success to trained and to unseen goals as PNG; of generalise, success and SPL by the number
+            of rooms trained in.
         scenes: bundled names and files, in order; the bundled rooms that the runs name when not given.
         resamples: of the bootstrap.
         threads: processor threads; more than 1 pays on an idle machine only.
@@ -61,7 +63,11 @@ def print_tables(
         for path in write_documents(results, check_folder(docs, "docs")):
             print(path)
     elif experiments == ["generalise"]:
-        print(unseen_table(read_runs(results, "generalise")))
+        drawn = None if plot is None else check_file(plot, "plot")
+        found = read_runs(results, "generalise")
+        print(unseen_table(found))
+        if drawn is not None:
+            print(draw_growth(found, drawn), file=sys.stderr)
     elif experiments == ["robustness"]:
         print(robustness_table(read_runs(results, "robustness")))
     else:

@@ -17,7 +17,7 @@ from vusfa.experiments.runs import Run
 from vusfa.report.markdown import markdown
 from vusfa.report.result_tables import COMPARED
 
-__all__ = ["policy_sums", "unseen_table"]
+__all__ = ["policy_sums", "run_label", "unseen_table"]
 
 _GAP = "in 100, less the random walk"
 
@@ -55,7 +55,7 @@ def _table(runs: Sequence[Run]) -> str:
     """Of runs that were tested in the same rooms."""
     named: dict[str, list[Run]] = {}
     for run in runs:
-        named.setdefault(_name(run), []).append(run)
+        named.setdefault(run_label(run), []).append(run)
     rows: list[dict[str, Any]] = []
     for name, group in named.items():
         rows += _rows(group, f"{name}: " if len(named) > 1 else "")
@@ -81,8 +81,8 @@ def _rows(runs: Sequence[Run], prefix: str) -> list[dict[str, Any]]:
     return [*rows, {"policy": RANDOM_WALK, "seeds": None, **means}]
 
 
-def _name(run: Run) -> str:
-    """Of the agent: that of the run without part and seed."""
+def run_label(run: Run) -> str:
+    """Name of the agent: that of the run without part and seed."""
     name, part = run.name.rpartition("-")[0], run.info.get("part")
     return name.removesuffix(f"-{part}") if part else name
 
