@@ -2,8 +2,8 @@
 
 Each FILE that ``benchmarks/run.py`` wrote is taken over into results/benchmarks, one file per suite, with the
 machine's description reduced to what the page shows. Then every suite becomes docs/generated/speed-SUITE.md;
-one without a file there says that it has not been measured. A suite that was measured with --avx2, too, has a
-second table, speed-SUITE-avx2.md.
+one without a file there says that it has not been measured. What was measured on a processor without bfloat16
+units, or with --avx2, goes to SUITE-avx2.json and has a second table, speed-SUITE-avx2.md.
 """
 
 from __future__ import annotations
@@ -44,7 +44,8 @@ def take_over(path: Path, results: Path) -> list[Path]:
         content = json.loads(path.read_text(encoding="utf-8"))
         quick, suites = content["options"]["quick"], content["suites"]
         machine = {name: content["machine"][name] for name in FACTS}
-        ending = "-avx2" * content["options"].get("avx2", False)
+        bfloat16 = {"avx512_bf16", "amx_bf16"} & set(machine["cpu_flags"])
+        ending = "-avx2" * (content["options"].get("avx2", False) or not bfloat16)
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise ConfigError(f"{path}: is no report of benchmarks/run.py ({error})") from error
     if quick:

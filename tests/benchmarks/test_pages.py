@@ -45,7 +45,8 @@ def test_every_committed_report_is_a_full_one_of_a_suite_with_no_more_of_the_mac
     for path in paths:
         content = json.loads(path.read_text(encoding="utf-8"))
         assert [suite["suite"] for suite in content["suites"]] == [path.stem.removesuffix("-avx2")]
-        assert content["options"].get("avx2", False) == path.stem.endswith("-avx2")
+        bfloat16 = {"avx512_bf16", "amx_bf16"} & set(content["machine"]["cpu_flags"])
+        assert path.stem.endswith("-avx2") == (content["options"].get("avx2", False) or not bfloat16)
         assert not content["options"]["quick"]
         assert set(content["machine"]) == set(FACTS)
         assert "/work" not in path.read_text(encoding="utf-8")
@@ -53,7 +54,7 @@ def test_every_committed_report_is_a_full_one_of_a_suite_with_no_more_of_the_mac
 
 
 def test_a_report_is_taken_over_without_its_system_and_shown_with_its_failures(tmp_path: Path) -> None:
-    machine = {**describe_machine(), "foreign_load": 0.1}
+    machine = {**describe_machine(), "foreign_load": 0.1, "cpu_flags": ["avx2", "avx512_bf16"]}
     written = write_reports(
         tmp_path / "all.json", machine, Options(cap=60.0), [REPORT, Report("gpu", skipped="no device")]
     )
@@ -76,7 +77,7 @@ def test_a_report_is_taken_over_without_its_system_and_shown_with_its_failures(t
 
 
 def test_a_measurement_that_was_limited_to_avx2_stands_beside_the_other(tmp_path: Path) -> None:
-    machine = {**describe_machine(), "foreign_load": 0.0}
+    machine = {**describe_machine(), "foreign_load": 0.0, "cpu_flags": ["avx2", "amx_bf16"]}
     results = tmp_path / "results"
     for options in (Options(), Options(avx2=True)):
         take_over(write_reports(tmp_path / "eval.json", machine, options, [REPORT]), results)
@@ -85,6 +86,18 @@ def test_a_measurement_that_was_limited_to_avx2_stands_beside_the_other(tmp_path
     assert "`python benchmarks/run.py --suite eval --avx2`" in made["speed-eval-avx2.md"]
     assert "; torch, oneDNN and MKL limited to AVX2. Other programs" in made["speed-eval-avx2.md"]
     assert "speed-env-avx2.md" not in made
+
+
+def test_a_processor_without_bfloat16_stands_beside_one_with_it(tmp_path: Path) -> None:
+    results = tmp_path / "results"
+    for flags in (["avx2"], ["avx2", "avx512f", "avx512_bf16"]):
+        machine = {**describe_machine(), "foreign_load": 0.0, "cpu_flags": flags}
+        take_over(write_reports(tmp_path / "eval.json", machine, Options(), [REPORT]), results)
+    assert sorted(path.name for path in results.iterdir()) == ["eval-avx2.json", "eval.json"]
+    text = documents(results)["speed-eval-avx2.md"]
+    assert "(avx2), " in text
+    assert "`python benchmarks/run.py --suite eval`" in text
+    assert "limited" not in text
 
 
 def test_a_quick_or_foreign_file_is_refused(tmp_path: Path) -> None:
