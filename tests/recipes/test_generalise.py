@@ -10,9 +10,10 @@ import pytest
 
 from vusfa.errors import ConfigError, SceneError, VusfaError
 from vusfa.evaluation.searchers import SEARCHERS
-from vusfa.experiments.generalise import rooms_of, split_rooms
+from vusfa.experiments.generalise import policies, rooms_of, split_rooms
 from vusfa.experiments.runs import read_run
-from vusfa.scenes import Scene
+from vusfa.modules import make_agent
+from vusfa.scenes import Scene, SceneSet
 
 SMALL = [
     "agent.hidden_size=8",
@@ -122,3 +123,23 @@ def test_trained_in_some_rooms_and_tested_in_others(
     recipe("generalise").generalise(rooms, SMALL, **asked)  # the checkpoint is there: the same numbers
     again = read_run(tmp_path / "results", "generalise", "vusfa-0")
     assert again.episodes["agent"].equal(cell.episodes["agent"])
+
+
+def test_an_agent_that_remembers_by_itself_walks_without_a_count_of_tried_actions(rooms: Path) -> None:
+    scenes = SceneSet.open([str(rooms / "hall-1.h5")])
+    agents: dict[str, Any] = {"hidden_size": 8, "embedding_size": 8, "scenes": scenes, "shared_heads": True}
+    assert set(policies(make_agent("gvf", memory="lstm", **agents), scenes, 3.0, 1.0)) == {"agent", "memory"}
+    assert set(policies(make_agent("gvf", **agents), scenes, 3.0, 1.0)) == {"agent", "agent-memory", "memory"}
+
+
+def test_imitation_trains_and_is_tested_in_other_rooms(
+    recipe: Callable[[str], Any], rooms: Path, tmp_path: Path
+) -> None:
+    results, small = tmp_path / "results", [each for each in SMALL if "history" not in each]
+    recipe("generalise").generalise(
+        rooms, ["preset=imitation", "agent.fusion=concatenation", *small], trained=2, tested=1, episodes=2,
+        results=results, runs=tmp_path / "runs", searchers=False,
+    )  # fmt: skip
+    run = read_run(results, "generalise", "vusfa-0")
+    assert set(run.episodes) == {"agent", "memory"}
+    assert len(run.episodes["agent"].success) == 2 * 36

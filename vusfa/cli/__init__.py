@@ -89,6 +89,12 @@ FUNCTIONS: dict[str, Forwarded] = {
         {"": "vusfa.experiments.generalise.generalise"},
         ("vusfa generalise rooms/small", "vusfa generalise rooms/small total_frames=1000000 seed=1"),
     ),
+    "transplant": Forwarded(
+        "Take an agent to rooms that it has never seen.",
+        {"": "vusfa.experiments.transplant_run.transplant_run"},
+        ("vusfa transplant runs/first rooms/hall.h5 rooms/attic.h5 folder=runs/elsewhere",),
+        panel="Agents",
+    ),
     "robustness": Forwarded(
         "Evaluate an agent in changed renderings of its rooms.",
         {"": "vusfa.deploy.robustness.robustness"},

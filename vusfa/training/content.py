@@ -177,7 +177,7 @@ def check_entries(path: str | Path, state: Mapping[str, Any]) -> None:
         if not all(isinstance(item, str) for item in (state[group] if group else state)[key]):
             raise mended(path, f"its entry {name!r} holds something else than text")
     goals = state["goals"]
-    if goals.dtype != torch.int64 or goals.ndim != 1 or not len(goals):
+    if goals.dtype != torch.int64 or goals.ndim != 1:
         raise mended(path, f"its entry 'goals' is {_shown(goals)}, not a list of state ids")
     for name, value in state["agent"].items():
         if not isinstance(value, Tensor):
