@@ -85,7 +85,7 @@ def test_models_learn_what_is_theirs_besides(scene_file: Path, model: str) -> No
 
 def test_own_transitions_are_labels_too(scene_file: Path) -> None:
     """At first few paths are known; of a scene that is walked whole, as many as its graph has."""
-    one = trainer(scene_file, "algorithm.expert=experience", "agent.model=gvf", "collector.num_envs=4")
+    one = trainer(scene_file, "algorithm.expert=experience", "agent.model=gvf", "collector.num_envs=8")
     expert = one.algorithm.expert  # type: ignore[attr-defined]
     assert expert.num_transitions == 0
     with one.collecting() as batches:

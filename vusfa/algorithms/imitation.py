@@ -38,7 +38,7 @@ class ImitationSettings(AlgorithmSettings):
     """
 
     expert: str = "scenes"
-    minibatches: int = 4
+    minibatches: int = 8
     critic_coeff: float = 1.0
     objective_coeff: float = 1.0
 
