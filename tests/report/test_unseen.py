@@ -61,3 +61,11 @@ def test_what_cannot_be_shown() -> None:
     other.episodes["agent"].goal[0] = 4
     with pytest.raises(ResultError, match="different goals"):
         unseen_table([cell(0, [5, 5, 5, 5]), other])
+
+
+def test_searchers_that_one_seed_alone_was_tested_beside() -> None:
+    runs = [cell(0, [5, 10, 200, 500]), cell(1, [5, 50, 20, 100])]
+    runs[1].episodes["shortest-path"] = cell(0, [5, 5, 5, 5]).episodes["agent"]
+    lines = unseen_table(runs).splitlines()[2:]
+    rows = [[part.strip().split(" ")[0] for part in line.split("|")[1:4]] for line in lines]
+    assert rows == [["agent", "2", "87.5"], ["shortest-path", "1", "100.0"], ["random", "–", "75.0"]]

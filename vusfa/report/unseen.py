@@ -67,16 +67,18 @@ def _table(runs: Sequence[Run]) -> str:
 
 
 def _rows(runs: Sequence[Run], prefix: str) -> list[dict[str, Any]]:
-    """Of runs of one name."""
+    """Of runs of one name, of which some may lack the searchers."""
     tables = [run.rows() for run in runs]
-    baseline, scene = policy_sums(tables, "exact")
     rows: list[dict[str, Any]] = []
-    for mode in runs[0].episodes:
-        sums, _ = policy_sums(tables, mode)
+    for mode in dict.fromkeys(mode for run in runs for mode in run.episodes):
+        walked = [table for run, table in zip(runs, tables, strict=True) if mode in run.episodes]
+        baseline, scene = policy_sums(walked, "exact")
+        sums, _ = policy_sums(walked, mode)
         means = {name: bootstrap_mean(sums[name], scene) for name in COMPARED}
         gap = paired_difference(sums["success_100"], baseline["success_100"], scene)
         policy = mode if mode in SEARCHERS else prefix + mode
-        rows.append({"policy": policy, "seeds": len(runs), **means, _GAP: gap})
+        rows.append({"policy": policy, "seeds": len(walked), **means, _GAP: gap})
+    baseline, scene = policy_sums(tables, "exact")
     means = {name: bootstrap_mean(baseline[name], scene) for name in COMPARED}
     return [*rows, {"policy": RANDOM_WALK, "seeds": None, **means}]
 
