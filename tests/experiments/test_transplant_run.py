@@ -18,7 +18,7 @@ from vusfa.scenes import Scene
 from vusfa.training import load_agent
 
 SMALL = ["agent.model=vusfa", "agent.hidden_size=8", "agent.embedding_size=8", "evaluation=none"]
-SMALL += ["total_frames=200", "collector.num_envs=4", "collector.rollout=5"]
+SMALL += ["total_frames=200", "collector.num_envs=8", "collector.rollout=5"]
 
 
 def trained(folder: Path, scene: Path, *overrides: str) -> Path:

@@ -60,7 +60,7 @@ class Algorithm:
         self.agent, self.scenes, self.settings = agent, scenes, settings
         self.threads = threads_per_step(settings)
         if (frames := self._feature_frames()) is not None:
-            frames.dropout = settings["env"].get("crop_dropout", 0.0)
+            frames.dropout = settings.get("env", {}).get("crop_dropout", 0.0)
 
     def _feature_frames(self) -> FeatureFrames | None:
         """Where an agent that reads ids looks features up; None for any other."""

@@ -100,7 +100,7 @@ def make_correlation(scenes: SceneSet, out_features: int) -> PartCorrelation:
     if rows * columns == 1:
         raise ConfigError(
             "agent.fusion=correlation compares parts of pictures, and the scenes' features are of whole"
-            " pictures; encode them with 'vusfa scenes encode SCENE.h5 --layer _blocks.14 --grid 3x4'"
+            " pictures; encode them with 'vusfa scenes encode SCENE.h5 MAP.h5 --layer _blocks.14 --grid 3x4'"
         )
     return PartCorrelation(scenes.feature_size, rows * columns, out_features)
 
