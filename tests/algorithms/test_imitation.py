@@ -13,6 +13,7 @@ from vusfa.algorithms.imitation import EXPERTS, all_transitions
 from vusfa.cli.launch import compose
 from vusfa.errors import CheckpointError, ConfigError
 from vusfa.evaluation import evaluate
+from vusfa.experiments.training import compose_settings, train
 from vusfa.modules import InferencePolicy
 from vusfa.scenes import SceneSet
 from vusfa.training import Trainer, load_checkpoint, make_trainer
@@ -138,3 +139,15 @@ def test_it_resumes(scene_file: Path, tmp_path: Path, expert: str) -> None:
 def test_what_makes_no_sense_is_refused(scene_file: Path, overrides: list[str], told: str) -> None:
     with pytest.raises(ConfigError, match=told):
         trainer(scene_file, *overrides)
+
+
+def test_a_checkpoint_from_before_these_settings_goes_on(scene_file: Path, tmp_path: Path) -> None:
+    small = ["agent.hidden_size=8", "agent.embedding_size=8", "collector.num_envs=4", "collector.rollout=5"]
+    small += [f"scenes=[{scene_file}]", "evaluation=none", f"folder={tmp_path / 'run'}", "total_frames=40"]
+    path = train(compose_settings(small)).trainer and tmp_path / "run" / "checkpoint.pt"
+    state = torch.load(path, weights_only=True)
+    for name in ("fusion", "previous_action"):
+        del state["agent_config"][name], state["config"]["agent"][name]
+    torch.save(state, path)
+    resumed = train(compose_settings([*small[:-1], "total_frames=80", "resume=auto"]))
+    assert resumed.trainer.frames == 80

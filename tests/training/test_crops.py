@@ -161,7 +161,9 @@ def test_an_agent_that_is_handed_features_is_evaluated_on_the_first_crop(room: P
 
 def test_dropout_of_features_is_drawn_for_every_look_up_and_evaluation_has_none(room: Path) -> None:
     trainer = made(room, "env.crop_dropout=0.5")
+    trainer.agent.eval()
     table = frames(trainer).lookup(None).clone()
+    trainer.agent.train()
     one = frames(trainer).lookup(None).clone()
     other = frames(trainer).lookup(None)
     assert torch.allclose(one, torch.where(one == 0, 0.0, 2 * table))

@@ -96,9 +96,7 @@ class AgentSettings:
     shared_encoder: bool | None
     embedding_layer: bool | None
     state_layer: bool | None
-    fusion: str | None
     memory: str | None
-    previous_action: bool | None
     shared_heads: bool | None
     pretrained: str | None
     successor_norm: str | None
@@ -108,6 +106,8 @@ class AgentSettings:
     eval_latent: str | None
     successor_scale: float | None
     reward_scale: float | None
+    fusion: str | None = None  # later than version 0.2, whose checkpoints have neither
+    previous_action: bool | None = None
 
 
 @dataclass

@@ -171,7 +171,7 @@ class InferencePolicy(AtHome, TensorDictModuleBase):
         if any(entry is None for entry in (state, goal, scene, *marks)):
             raise ConfigError(
                 f"the policy reads {self.in_keys}, some are missing; TargetNavEnv sends ids, the transform"
-                " vusfa.envs.SceneObservation observations, agent.make_env_transforms() what a memory reads"
+                " SceneObservation adds observations, agent.make_env_transforms() what a memory reads"
             )
         batch = scene.dim()
         rows = state.reshape(-1, *state.shape[batch:]), goal.reshape(-1, *goal.shape[batch:])

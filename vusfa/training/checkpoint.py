@@ -42,7 +42,7 @@ from vusfa.envs.scene_env import usable_device
 from vusfa.errors import CheckpointError, SceneError, VusfaError
 from vusfa.files import replacing
 from vusfa.limits import brief, listing, one_line
-from vusfa.modules import Agent, make_agent
+from vusfa.modules import Agent, AgentConfig, make_agent
 from vusfa.scenes import SceneSet
 from vusfa.training.content import NO_VALIDATION, check_entries, check_like, mended, read_content
 from vusfa.training.scene_files import find_given, find_sources, with_goals
@@ -180,7 +180,8 @@ def check_fits(
     check_scenes(path, state["scenes"], scenes)
     for key, value in agent.config.items():
         if key not in _OF_SCENES:
-            check_setting(path, f"agent.{key}", state["agent_config"].get(key), value)
+            default = getattr(AgentConfig, key, None)  # of a field that is younger than the checkpoint
+            check_setting(path, f"agent.{key}", state["agent_config"].get(key, default), value)
     check_setting(path, "env.goals", state["goals"].tolist(), goals.tolist())
 
 
