@@ -49,7 +49,8 @@ def test_help_lists_settings_and_choices(vusfa: Callable[..., Any], tmp_path: Pa
     text = vusfa("train", "--help").stdout
     assert text.lstrip().startswith("vusfa train SETTING=VALUE")
     for words in (
-        "algorithm: autoencoder, contrastive, forward_backward, hindsight, imitation, implicit_q,",
+        "algorithm: autoencoder, contrastive, forward_backward, hindsight, imitation, implicit_q,"
+        " replay_search, usf",
         "total_frames: 6000000",
         "--multirun",
     ):

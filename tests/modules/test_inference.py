@@ -110,7 +110,7 @@ def test_an_agent_with_a_memory_walks_alike(
         assert torch.equal(walk["action"], walks[0]["action"])
         for key in ("recurrent_state_h", "recurrent_state_c"):
             torch.testing.assert_close(walk["next", key], walks[0]["next", key])
-    with pytest.raises(ConfigError, match=r"'is_init'\], some are missing; .* agent.make_env_transforms"):
+    with pytest.raises(ConfigError, match=r"reads 'is_init'; give the environment agent.make_env_transforms"):
         policy(env.base_env.reset())
 
 

@@ -14,8 +14,9 @@ ROOT = Path(__file__).parents[2]
 
 def test_the_committed_tables_are_what_the_command_prints(tmp_path: Path) -> None:
     made = {path.name: path.read_text() for path in write_documents(ROOT / "results", tmp_path / "made")}
-    heads = f"<!-- {COMMAND} -->\n\n| ", f"<!-- {COMMAND} -->\n\n**Tested in "
-    assert all(text.startswith(heads) for text in made.values())
+    parted = made["generalise.md"]  # a table per set of rooms
+    assert parted.startswith(f"<!-- {COMMAND} -->\n\n**Tested in ")
+    assert all(text.startswith(f"<!-- {COMMAND} -->\n\n| ") for text in made.values() if text != parted)
     kept = {name: (ROOT / "docs/generated" / name).read_text() for name in made}
     assert {name for name in made if made[name] != kept[name]} == set(), f"run {COMMAND}, and commit"
 

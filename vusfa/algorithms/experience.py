@@ -14,8 +14,7 @@ from vusfa.scenes.paths import ShortestPaths
 
 __all__ = ["ExperienceGraph", "merge_graphs", "passing_weights"]
 
-
-#: Seen states of a scene up to which all its shortest paths are computed at once, not goal by goal.
+#: Seen states of a scene up to which labels are looked up in a table of all its shortest paths.
 TABULATED = 256
 
 
@@ -123,8 +122,6 @@ class ExperienceGraph:
             following = self.successor[states]
             place = torch.where(following < 0, -1, torch.searchsorted(states, following))
             self._scenes[scene] = states, place, ShortestPaths(place.numpy())
-            if len(states) <= TABULATED:
-                _ = self._scenes[scene][2].table
         return self._scenes[scene]
 
     def sample(self, num_goals: int, batch_size: int, path_share: float = 0.5) -> TensorDict:
@@ -184,6 +181,8 @@ class ExperienceGraph:
         for number in scene[scene >= 0].unique().tolist():
             row = (scene == number).nonzero().squeeze(-1)
             states, place, paths = self._scene(number)
+            if len(states) <= TABULATED:
+                _ = paths.table  # in which between() looks paths up from now on
             here, there = (torch.searchsorted(states, ids[row]) for ids in (rows, ends))
             steps[row] = length = paths.between(here, there).clamp(min=0)
             following = place[here]

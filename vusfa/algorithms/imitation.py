@@ -14,10 +14,10 @@ from torchrl.modules import set_recurrent_mode
 from vusfa.algorithms.base import AlgorithmSettings
 from vusfa.algorithms.experience import ExperienceGraph, merge_graphs
 from vusfa.algorithms.registry import register_algorithm
+from vusfa.algorithms.replay_search import make_search_loss
 from vusfa.algorithms.usf import USF
 from vusfa.errors import CheckpointError, ConfigError, near
 from vusfa.modules import Agent
-from vusfa.objectives.search import SearchLoss
 from vusfa.scenes import SceneSet
 
 __all__ = ["EXPERTS", "Imitation", "ImitationSettings"]
@@ -83,16 +83,7 @@ class Imitation(USF):
         self.expert = ExperienceGraph(scenes.num_states, scenes.num_actions)
         if not self._learns_graph:
             self.expert.extend(all_transitions(scenes))
-        options = {name: numbers[name] for name in ("critic_coeff", "objective_coeff")}
-        options |= {name: settings["env"][name] for name in ("goal_reward", "step_reward")}
-        networks = agent.get_policy_operator(), agent.get_value_operator()
-        try:
-            self.search_loss = SearchLoss(
-                *networks, **options, gamma=settings["objective"]["gamma"], functional=False
-            )
-        except ValueError as error:
-            raise ConfigError(f"algorithm=imitation: {error}") from error
-        self.search_loss.to(next(agent.parameters()).device)
+        self.search_loss = make_search_loss("algorithm=imitation", agent, settings)
         #: Whether the model has terms of its own besides: TD of psi, the bottleneck's KL.
         self.has_more = agent.successor is not None or bool(self.terms)
 

@@ -18,7 +18,7 @@ from vusfa.modules import Agent
 from vusfa.objectives.search import SearchLoss
 from vusfa.scenes import SceneSet
 
-__all__ = ["ReplaySearch", "ReplaySearchSettings"]
+__all__ = ["ReplaySearch", "ReplaySearchSettings", "make_search_loss"]
 
 #: Frames of walking before the first search, at most, where settings give none.
 MAX_START = 100_000
@@ -46,6 +46,28 @@ class ReplaySearchSettings(AlgorithmSettings):
     learning_starts: int | None = None
     critic_coeff: float = 1.0
     objective_coeff: float = 1.0
+
+
+def make_search_loss(where: str, agent: Agent, settings: Mapping[str, Any]) -> SearchLoss:
+    """The loss of an agent's actor and critic, with the rewards and the discount of a training.
+
+    Args:
+        where: start of an error's message.
+        agent: what learns.
+        settings: all settings; ``settings["algorithm"]`` has the coefficients.
+
+    Raises:
+        ConfigError: a setting out of its range.
+    """
+    options = {name: settings["algorithm"][name] for name in ("critic_coeff", "objective_coeff")}
+    options |= {name: settings["env"][name] for name in ("goal_reward", "step_reward")}
+    options["gamma"] = settings["objective"]["gamma"]
+    networks = agent.get_policy_operator(), agent.get_value_operator()
+    try:
+        loss = SearchLoss(*networks, **options, functional=False)
+    except ValueError as error:
+        raise ConfigError(f"{where}: {error}") from error
+    return loss.to(next(agent.parameters()).device)
 
 
 @register_algorithm("replay_search")
@@ -83,15 +105,7 @@ class ReplaySearch(USF):
         check_replay("replay_search", agent, self.threads, history=1)
         self._searches = False
         self.graph = ExperienceGraph(scenes.num_states, scenes.num_actions)
-        rewards = {name: settings["env"][name] for name in ("goal_reward", "step_reward")}
-        options = {name: numbers[name] for name in ("critic_coeff", "objective_coeff")} | rewards
-        options["gamma"] = settings["objective"]["gamma"]
-        networks = agent.get_policy_operator(), agent.get_value_operator()
-        try:
-            self.search_loss = SearchLoss(*networks, **options, functional=False)
-        except ValueError as error:
-            raise ConfigError(f"replay_search: {error}") from error
-        self.search_loss.to(next(agent.parameters()).device)
+        self.search_loss = make_search_loss("replay_search", agent, settings)
 
     def schedule(self, frames: int) -> None:
         """Begin to search after ``learning_starts``, once and for all."""

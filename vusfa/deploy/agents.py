@@ -23,12 +23,11 @@ from vusfa.errors import CheckpointError, ConfigError, near
 from vusfa.files import replacing
 from vusfa.limits import MAX_JSON_BYTES, brief
 from vusfa.modules import Agent
-from vusfa.scenes import SceneSet, bundled_names
-from vusfa.scenes.store import bundled_path
+from vusfa.scenes import SceneSet
 from vusfa.training import load_agent
 from vusfa.training.checkpoint import saved_agent
 from vusfa.training.content import check_sizes
-from vusfa.training.scene_files import find_sources, scene_sources
+from vusfa.training.scene_files import find_sources, opened_from, scene_sources
 
 __all__ = [
     "PRETRAINED",
@@ -170,14 +169,11 @@ def save_agent(path: str | os.PathLike[str], agent: Agent, scenes: SceneSet, goa
     Raises:
         ConfigError: safetensors is missing.
     """
-    bundled = {bundled_path(name).resolve(): name for name in bundled_names()}
-    files = [scene.path for scene in scenes.scenes]
-    sources = [bundled.get(file, str(file)) if file else "" for file in files]
     header = {
         "vusfa": __version__,
         "agent_config": agent.config,
         "scenes": {
-            "sources": scene_sources(sources, Path(path).parent),
+            "sources": scene_sources(opened_from(scenes), Path(path).parent),
             "names": list(scenes.names),
             "fingerprint": scenes.fingerprint,
         },

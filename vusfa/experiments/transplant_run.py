@@ -9,12 +9,11 @@ import torch
 from vusfa.errors import ConfigError
 from vusfa.files import check_folder, say, write_json
 from vusfa.modules import transplant
-from vusfa.scenes import Scene, SceneSet, bundled_names
-from vusfa.scenes.store import bundled_path
+from vusfa.scenes import SceneSet
 from vusfa.training import load_agent
 from vusfa.training.checkpoint import save_checkpoint
 from vusfa.training.content import NO_VALIDATION
-from vusfa.training.scene_files import scene_sources, settings_seen_from
+from vusfa.training.scene_files import opened_from, scene_sources, settings_seen_from
 
 __all__ = ["transplant_run"]
 
@@ -43,7 +42,7 @@ def transplant_run(checkpoint: Path, rooms: list[str], *, folder: Path) -> Path:
     agent, _, state = load_agent(checkpoint)
     scenes = SceneSet.open(rooms)
     moved = transplant(agent, scenes)
-    sources = [_source(scene) for scene in scenes.scenes]
+    sources = opened_from(scenes)
     config = settings_seen_from(folder, {**state["config"], "scenes": sources})
     state |= {
         "agent": moved.state_dict(),
@@ -64,10 +63,3 @@ def transplant_run(checkpoint: Path, rooms: list[str], *, folder: Path) -> Path:
     write_json(folder / "config.json", config)
     say(f"next: vusfa evaluate {folder}, vusfa report {folder}, vusfa film {folder}")
     return target
-
-
-def _source(scene: Scene) -> str:
-    """Name of a bundled room, or path of a file."""
-    if scene.name in bundled_names() and scene.path == bundled_path(scene.name).resolve():
-        return scene.name
-    return str(scene.path)

@@ -191,8 +191,9 @@ class Agent(nn.Module):
         )
         gaussian = ["state_loc", "state_scale", "state_kl", "goal_loc", "goal_scale", "goal_kl"]
         written = ["state_embedding", "goal_embedding", *(gaussian if self.latent else []), "fused"]
-        trunk = SiameseTrunk(self.encoder, self.fusion)
-        if self.correlation is not None:
+        if self.correlation is None:
+            trunk = SiameseTrunk(self.encoder, self.fusion)
+        else:
             trunk = CorrelationTrunk(self.encoder, self.fusion, self.correlation)
         steps: dict[str, Step] = {"trunk": Observing(trunk, read, written)}
         fused = "fused"

@@ -11,7 +11,7 @@ from torch.nn import functional
 
 from vusfa.errors import ConfigError
 from vusfa.modules.precision import autocast_copy
-from vusfa.modules.siamese import SiameseEncoder, joined
+from vusfa.modules.siamese import SiameseEncoder
 from vusfa.modules.trunk import Fusion, SiameseTrunk, inverse_index
 from vusfa.modules.unique import Rows, gather, shapes_may_vary, unique_rows
 from vusfa.scenes import SceneSet
@@ -127,34 +127,19 @@ class CorrelationTrunk(SiameseTrunk):
         super().__init__(encoder, fusion)
         self.correlation = correlation
 
-    def _written(self, state: Tensor, goal: Tensor) -> tuple[Tensor, ...]:
-        encoder, batch = self.encoder, self.encoder.batch_shape(state)
-        states, goals = encoder.first_layer(state, goal)
-        of_state, of_goal = encoder.encode_state(states.values), encoder.encode_goal(goals.values)
-        parts = Rows(of_state.embedding, states.inverse), Rows(of_goal.embedding, goals.inverse)
-        fused = self._fuse(*parts, state, goal).view(*batch, -1)
-        return *joined(of_state.gather(states.inverse, batch), of_goal.gather(goals.inverse, batch)), fused
-
-    def _fused(self, state: Tensor, goal: Tensor) -> Tensor:
-        states, goals = self.encoder.first_layer(state, goal)
-        of_state = Rows(self.encoder.embed_state(states.values), states.inverse)
-        of_goal = Rows(self.encoder.embed_goal(goals.values), goals.inverse)
-        return self._fuse(of_state, of_goal, state, goal).view(*self.encoder.batch_shape(state), -1)
-
     def cached(
         self, goals: Tensor | None = None, rows: int | None = None, states: Tensor | None = None
     ) -> Any:
         """An object with :meth:`fused` for constant weights; arguments of :class:`CachedCorrelation`."""
         return CachedCorrelation(self, goals, rows, states)
 
-    def _fuse(self, of_state: Rows, of_goal: Rows, state: Tensor, goal: Tensor) -> Tensor:
-        """Rows (R, hidden) from embeddings, and from what was given to :meth:`forward`."""
-        state_part = gather(self.fusion.state_part(of_state.values), of_state.inverse)
-        goal_part = gather(self.fusion.goal_part(of_goal.values), of_goal.inverse)
+    def _sum(self, of_state: Rows, of_goal: Rows, state: Tensor, goal: Tensor) -> Tensor:
+        """With the correlation of the pictures."""
+        summed = super()._sum(of_state, of_goal, state, goal)
         states, goals = self._pictures(state, goal)
         queries = gather(self.correlation.queries(states.values), states.inverse)
         keys = gather(self.correlation.keys(goals.values), goals.inverse)
-        return functional.relu(state_part + goal_part + self.correlation(queries, keys))
+        return summed + self.correlation(queries, keys)
 
     def _pictures(self, state: Tensor, goal: Tensor) -> tuple[Rows, Rows]:
         """Features of the rows' newest frames and of their goals."""

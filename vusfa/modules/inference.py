@@ -166,18 +166,19 @@ class InferencePolicy(AtHome, TensorDictModuleBase):
         if self._table:
             return self._table[0](tensordict)
         state, goal, scene, *memory = (tensordict.get(key, None) for key in self.in_keys)
-        others = dict(zip(self._memory_keys, memory, strict=True))
-        marks = (others.get(key, scene) for key in ("is_init", "previous_action"))
-        if any(entry is None for entry in (state, goal, scene, *marks)):
+        if state is None or goal is None or scene is None:
             raise ConfigError(
-                f"the policy reads {self.in_keys}, some are missing; TargetNavEnv sends ids, the transform"
-                " SceneObservation adds observations, agent.make_env_transforms() what a memory reads"
+                f"the policy reads {self.in_keys}, and some of these are missing; TargetNavEnv sends ids, and"
+                " the transform vusfa.envs.SceneObservation adds observations"
             )
         batch = scene.dim()
         rows = state.reshape(-1, *state.shape[batch:]), goal.reshape(-1, *goal.shape[batch:])
         if not memory:
             actions = draw_actions(self._by_scene(*rows, scene.reshape(-1)), interaction_type())
             return tensordict.set("action", actions.view(scene.shape))
+        others = dict(zip(self._memory_keys, memory, strict=True))
+        if key := next((k for k in ("is_init", "previous_action") if others.get(k, scene) is None), None):
+            raise ConfigError(f"the policy reads {key!r}; give the environment agent.make_env_transforms()")
         others = {key: None if x is None else x.reshape(-1, *x.shape[batch:]) for key, x in others.items()}
         values = self._run(*rows, {"scene_id": scene.reshape(-1), **others})
         for key in self._written_keys:

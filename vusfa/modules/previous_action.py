@@ -36,14 +36,12 @@ class PreviousAction(Transform):
         return next_tensordict.set("previous_action", tensordict.get("action").clone())
 
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
-        none = self._none(tensordict_reset)
+        rows = tensordict_reset
+        none = torch.full(rows.batch_size, self.num_actions, dtype=torch.int64, device=rows.device)
         before, mask = tensordict.get("previous_action", None), tensordict.get("_reset", None)
         if before is not None and mask is not None:
             none = torch.where(mask.view(none.shape), none, before)
-        return tensordict_reset.set("previous_action", none)
-
-    def _none(self, rows: TensorDictBase) -> Tensor:
-        return torch.full(rows.batch_size, self.num_actions, dtype=torch.int64, device=rows.device)
+        return rows.set("previous_action", none)
 
     def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
         """With the entry."""

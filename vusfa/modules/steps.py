@@ -13,6 +13,8 @@ from vusfa.scenes import check_home
 
 __all__ = ["Actor", "AtHome", "Moved", "Observing", "Remembering", "Step"]
 
+_OF_MEMORY = "give the environment the transforms of agent.make_env_transforms()"
+
 
 class AtHome:
     """A policy to which TorchRL's collectors introduce themselves."""
@@ -51,10 +53,10 @@ class Observing(_SaysWhatIsMissing, Step):
 class Moved(_SaysWhatIsMissing, Step):
     """The step that reads the action before."""
 
-    mend = "give the environment the transforms of agent.make_env_transforms()"
+    mend = _OF_MEMORY
 
 
 class Remembering(_SaysWhatIsMissing, LSTMModule):
     """The recurrent step."""
 
-    mend = "give the environment the transforms of agent.make_env_transforms()"
+    mend = _OF_MEMORY

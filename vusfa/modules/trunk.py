@@ -12,7 +12,7 @@ from vusfa.modules.linear import SceneLinear
 from vusfa.modules.precision import autocast_copy, for_autocast, padded_linear
 from vusfa.modules.rows import RowScenes
 from vusfa.modules.siamese import SiameseEncoder, joined
-from vusfa.modules.unique import gather
+from vusfa.modules.unique import Rows, gather
 
 __all__ = ["CachedTrunk", "Fusion", "SceneLayer", "SiameseTrunk", "remember"]
 
@@ -68,12 +68,11 @@ class SiameseTrunk(nn.Module):
             raise
 
     def _written(self, state: Tensor, goal: Tensor) -> tuple[Tensor, ...]:
-        encoder, fusion, batch = self.encoder, self.fusion, self.encoder.batch_shape(state)
+        encoder, batch = self.encoder, self.encoder.batch_shape(state)
         states, goals = encoder.first_layer(state, goal)
         of_state, of_goal = encoder.encode_state(states.values), encoder.encode_goal(goals.values)
-        state_part = gather(fusion.state_part(of_state.embedding), states.inverse)
-        goal_part = gather(fusion.goal_part(of_goal.embedding), goals.inverse)
-        fused = functional.relu(state_part + goal_part).view(*batch, -1)
+        embeddings = Rows(of_state.embedding, states.inverse), Rows(of_goal.embedding, goals.inverse)
+        fused = functional.relu(self._sum(*embeddings, state, goal)).view(*batch, -1)
         return *joined(of_state.gather(states.inverse, batch), of_goal.gather(goals.inverse, batch)), fused
 
     def fused(self, state: Tensor, goal: Tensor) -> Tensor:
@@ -92,9 +91,15 @@ class SiameseTrunk(nn.Module):
 
     def _fused(self, state: Tensor, goal: Tensor) -> Tensor:
         states, goals = self.encoder.first_layer(state, goal)
-        state_part = gather(self.fusion.state_part(self.encoder.embed_state(states.values)), states.inverse)
-        goal_part = gather(self.fusion.goal_part(self.encoder.embed_goal(goals.values)), goals.inverse)
-        return functional.relu(state_part + goal_part).view(*self.encoder.batch_shape(state), -1)
+        of_state = Rows(self.encoder.embed_state(states.values), states.inverse)
+        of_goal = Rows(self.encoder.embed_goal(goals.values), goals.inverse)
+        summed = self._sum(of_state, of_goal, state, goal)
+        return functional.relu(summed).view(*self.encoder.batch_shape(state), -1)
+
+    def _sum(self, of_state: Rows, of_goal: Rows, state: Tensor, goal: Tensor) -> Tensor:
+        """The fusion before its ReLU, (R, hidden), of embeddings; ``state``, ``goal``: of :meth:`forward`."""
+        state_part = gather(self.fusion.state_part(of_state.values), of_state.inverse)
+        return state_part + gather(self.fusion.goal_part(of_goal.values), of_goal.inverse)
 
 
 class CachedTrunk:

@@ -34,32 +34,23 @@ def growth(runs: Sequence[Run], metric: str) -> dict[str, dict[int, Estimate]]:
     """
     groups: dict[tuple[str, int, tuple[str, ...]], list[Run]] = {}
     for run in runs:
-        rooms = tuple(run.info["tested_in"])
-        groups.setdefault(
-            (run_label(run).rstrip("0123456789"), len(run.info["trained_in"]), rooms), []
-        ).append(run)
-    found: dict[str, dict[int, Estimate]] = {}
-    for (name, number, _), group in groups.items():
-        part = group[0].info.get("part")
+        series, rooms = run_label(run).rstrip("0123456789"), tuple(run.info["tested_in"])
+        groups.setdefault((series, len(run.info["trained_in"]), rooms), []).append(run)
+    found: dict[tuple[str, str], dict[int, Estimate]] = {}
+    for (series, number, _), group in groups.items():
+        part, tables = group[0].info.get("part"), [run.rows() for run in group]
         where = f" ({part})" if part else ""
-        tables = [run.rows() for run in group]
-        for mode, label, place in ((_AGENT, name, number), ("exact", RANDOM_WALK, 0)):
+        for mode, label, place in ((_AGENT, series, number), ("exact", RANDOM_WALK, 0)):
             sums, scene = policy_sums(tables, mode)
-            found.setdefault(label + where, {})[place] = bootstrap_mean(sums[metric], scene)
-    shown = {name: dict(sorted(points.items())) for name, points in found.items() if len(points) > 1}
-    if not shown:
+            found.setdefault((label, where), {})[place] = bootstrap_mean(sums[metric], scene)
+    grown = [key for key, points in found.items() if len(points) > 1]
+    if not grown:
         raise ResultError(
             "there is no series to draw: give vusfa generalise names that end in the number of rooms, such as"
             " name=rooms8 trained=8 and name=rooms30 trained=30"
         )
-    walks = {name: points for name, points in found.items() if name.startswith(RANDOM_WALK)}
-    return shown | {
-        name: points for name, points in walks.items() if any(name.endswith(_where(s)) for s in shown)
-    }
-
-
-def _where(series: str) -> str:
-    return series[series.index(" (") :] if " (" in series else ""
+    walks = [(RANDOM_WALK, where) for where in dict.fromkeys(where for _, where in grown)]
+    return {label + where: dict(sorted(found[label, where].items())) for label, where in [*grown, *walks]}
 
 
 def draw_growth(runs: Sequence[Run], path: str | Path) -> Path:
@@ -75,7 +66,7 @@ def draw_growth(runs: Sequence[Run], path: str | Path) -> Path:
         ticks: set[int] = set()
         for name, points in growth(runs, metric).items():
             values = [100 * estimate.value for estimate in points.values()]
-            if name.startswith(RANDOM_WALK):
+            if 0 in points:
                 panel.axhline(values[0], color="#777777", linestyle="--", lw=1, label=name)
                 continue
             errors = [

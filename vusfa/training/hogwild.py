@@ -70,9 +70,8 @@ class HogwildTrainer(Trainer):
             raise ConfigError(f"collector=hogwild needs device=cpu, not {settings['device']}")
 
     def _content(self, folder: Path, merged: Mapping[str, Any]) -> dict[str, Any]:
-        return copy.deepcopy(
-            super()._content(folder, merged)
-        )  # workers move the weights while a file is written
+        # workers move the weights while a file is written
+        return copy.deepcopy(super()._content(folder, merged))
 
     @contextmanager
     def collecting(self) -> Iterator[Iterator[Any]]:

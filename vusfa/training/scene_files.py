@@ -9,11 +9,13 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from vusfa.scenes import bundled_names
+from vusfa.scenes import SceneSet, bundled_names
+from vusfa.scenes.store import bundled_path
 
 __all__ = [
     "find_given",
     "find_sources",
+    "opened_from",
     "scene_sources",
     "settings_seen_from",
     "with_goals",
@@ -32,6 +34,16 @@ def scene_sources(scenes: str | Sequence[str], folder: str | Path) -> list[str]:
         name if name in bundled else os.path.relpath(os.path.realpath(name), os.path.realpath(folder))
         for name in given
     ]
+
+
+def opened_from(scenes: SceneSet) -> list[str]:
+    """Names of bundled rooms and paths of other files that scenes were read from; "" for one in memory.
+
+    >>> opened_from(SceneSet.bundled(["kitchen", "bathroom"]))
+    ['kitchen', 'bathroom']
+    """
+    bundled = {bundled_path(name).resolve(): name for name in bundled_names()}
+    return [bundled.get(scene.path, str(scene.path)) if scene.path else "" for scene in scenes.scenes]
 
 
 def find_sources(sources: Sequence[str], checkpoint: Path) -> list[str]:
