@@ -166,7 +166,7 @@ def test_no_mutation_ends_in_a_traceback(saved: tuple[Trainer, Path], tmp_path: 
         except VusfaError as error:
             assert "b.pt: " in str(error)  # noqa: PT017
             refused += 1
-    assert refused > 20
+    assert refused > 10  # the others left out or changed what a checkpoint need not hold, or held that value
 
 
 def test_archives_that_are_no_checkpoints(tmp_path: Path, checkpoint_state: dict[str, Any]):
