@@ -1,4 +1,4 @@
-"""Rooms never seen: python recipes/generalise.py rooms/small
+"""Rooms never seen: python recipes/generalise.py rooms/unseen
 
 Trains one agent in most of a folder of rooms, and sends it to every goal of the others. The same as ``vusfa
 generalise``; read vusfa/experiments/generalise.py.

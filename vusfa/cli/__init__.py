@@ -87,7 +87,7 @@ FUNCTIONS: dict[str, Forwarded] = {
     "generalise": Forwarded(
         "Train in some rooms, test in others.",
         {"": "vusfa.experiments.generalise.generalise"},
-        ("vusfa generalise rooms/small", "vusfa generalise rooms/small total_frames=1000000 seed=1"),
+        ("vusfa generalise rooms/unseen", "vusfa generalise rooms/small preset=unseen seed=1"),
     ),
     "transplant": Forwarded(
         "Take an agent to rooms that it has never seen.",

@@ -33,6 +33,8 @@ from vusfa.training import EvaluationProgress, load_agent, run_facts
 
 __all__ = ["generalise", "generalise_cell", "policies", "rooms_of", "run_name", "split_rooms"]
 
+PRESET = "preset=imitation"
+
 
 def split_rooms(folder: Path, trained: int, tested: int) -> tuple[list[str], list[str]]:
     """Dumps to train on and to test in: in the order of the numbers that their names end in, the first and
@@ -124,7 +126,8 @@ def generalise(
 
     Args:
         rooms: folder of dumps (.h5).
-        overrides: settings of vusfa train over those of preset=unseen.
+        overrides: settings of vusfa train over those of preset=imitation, whose agent reads features
+            with a grid (those of a split); preset=unseen reads any.
         name: of the results, before the seed.
         seed: of everything.
         seeds: of several agents, in place of one seed.
@@ -147,7 +150,7 @@ def generalise(
     check_folder(runs / "generalise", "runs")
     first, last, part = rooms_of(rooms, trained, tested, test)
     how["part"] = part
-    compose_settings(["preset=unseen", *overrides])  # mistakes show before any work
+    compose_settings([PRESET, *overrides])  # mistakes show before any work
     unseen = SceneSet.open(last)
     if searchers:
         check_searched(unseen)
@@ -189,7 +192,7 @@ def generalise_cell(
     results, runs = how["results"], how["runs"]
     torch.set_num_threads(1)
     unseen, folder = SceneSet.open(last), runs / "generalise" / f"{name}-{seed}"
-    settings = ["preset=unseen", *overrides, f"seed={seed}", f"scenes=[{','.join(map(as_text, first))}]"]
+    settings = [PRESET, *overrides, f"seed={seed}", f"scenes=[{','.join(map(as_text, first))}]"]
     if not (folder / "checkpoint.pt").exists():
         cfg = compose_settings([*settings, f"folder={as_text(str(folder))}", "evaluation=none"])
         if code := train(cfg, settings).exit_code:
