@@ -164,9 +164,14 @@ def test_the_rooms_of_a_split(
     assert not Scene.load(tmp_path / "rooms" / "hall-1.h5").has_pictures
     again = run("render-rooms", tmp_path / "rooms", f"split={tmp_path / 'rooms' / 'split.yaml'}")
     assert "4 of 4 files are there already" in again.stderr
-    for word in ("kind=[hall]", "seeds=1-2", "cells=20", "width=100", "vary=[dimmer]"):
+    for word in ("cells=20", "width=100", "vary=[dimmer]"):
         refused = run("render-rooms", tmp_path / "rooms", "split=unseen", word)
-        assert "leave these and plan out" in refused.stderr
+        assert "leave these, plan and vary out" in refused.stderr
+    few = ["render-rooms", tmp_path / "few", f"split={tmp_path / 'two.yaml'}"]
+    assert run(*few, "seeds=2-9", "kind=[hall]").exit_code == 0
+    assert [path.name for path in (tmp_path / "few").glob("*.h5")] == ["hall-3.h5"]
+    assert "split has no room of this kind and these seeds" in run(*few, "seeds=2").stderr
+    assert "no kind of room is called 'cellar'" in run(*few, "kind=[cellar]").stderr
     assert "is another split" in run("render-rooms", tmp_path / "rooms", "split=unseen").stderr
 
 

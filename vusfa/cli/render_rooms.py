@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -64,22 +64,35 @@ def _given(plan: Plan) -> Plan:
     return plan
 
 
-def _jobs_of(split: RoomSplit, folder: Path) -> Iterator[_Job]:
-    from vusfa.sources.render.kinds import programme
+def _jobs_of(split: RoomSplit, folder: Path, kinds: list[str], seeds: list[int] | None) -> Iterator[_Job]:
+    """Rooms of a split; of these kinds and seeds alone where some are given."""
     from vusfa.sources.render.layout import layout
     from vusfa.sources.render.variation import PLAIN
 
-    for kind in split.kinds:
-        programme(kind)  # an unknown kind is an error before any work
-    for part in split.parts:
-        for kind, seed, cells in split.rooms(part):
-            yield _Job(folder / f"{kind}-{seed}.h5", partial(layout, kind, seed, cells), PLAIN)
+    _check_kinds([*split.kinds, *kinds])
+    rooms = [
+        room
+        for part in split.parts
+        for room in split.rooms(part)
+        if (not kinds or room[0] in kinds) and (seeds is None or room[1] in seeds)
+    ]
+    if not rooms:
+        raise ConfigError("split has no room of this kind and these seeds; leave kind and seeds out for all")
+    for kind, seed, cells in rooms:
+        yield _Job(folder / f"{kind}-{seed}.h5", partial(layout, kind, seed, cells), PLAIN)
+
+
+def _check_kinds(kinds: Iterable[str]) -> None:
+    """An unknown kind is an error before any work."""
+    from vusfa.sources.render.kinds import programme
+
+    for kind in kinds:
+        programme(kind)
 
 
 def _jobs(
     folder: Path, plans: list[Path], kinds: list[str], seeds: list[int], cells: int | None, vary: list[str]
 ) -> Iterator[_Job]:
-    from vusfa.sources.render.kinds import programme
     from vusfa.sources.render.layout import layout
     from vusfa.sources.render.variation import PLAIN, load_variation
 
@@ -90,8 +103,7 @@ def _jobs(
     drawn: dict[str, Callable[[], Plan]] = {}
     for path in plans:
         drawn[path.stem] = partial(_given, find_plan(path))
-    for kind in kinds:
-        programme(kind)  # an unknown kind is an error before any work
+    _check_kinds(kinds)
     for seed in seeds:  # a stopped run has rooms of all kinds
         for kind in kinds:
             drawn[f"{kind}-{seed}"] = partial(layout, kind, seed, cells)
@@ -153,8 +165,8 @@ def render_rooms(
     split: Annotated[
         str | None,
         typer.Option(
-            help="A split into rooms to train in and to test in, in place of the options above, width and"
-            " samples: unseen (docs/generalise.md), or a YAML file. Its pictures are not kept."
+            help="A split into rooms to train in and to test in: unseen (docs/generalise.md), or a YAML file."
+            " It says cells, width and samples; kind and seeds choose among its rooms. Pictures are not kept."
         ),
     ] = None,
     width: Width = None,
@@ -183,6 +195,8 @@ def render_rooms(
         vusfa scenes render-rooms robust plan=[bathroom,kitchen] vary=[dimmer,camera,all]
 
         vusfa scenes render-rooms rooms/unseen split=unseen
+
+        vusfa scenes render-rooms rooms/unseen split=unseen seeds=53-60
     """
     from vusfa.cli.progress import progress
     from vusfa.files import check_folder
@@ -193,10 +207,10 @@ def render_rooms(
         from vusfa.experiments.room_split import read_split
         from vusfa.scenes.feature_grid import parse_grid
 
-        if plan or kind or seeds or vary or not cells is width is samples is None:
-            raise ConfigError("split has kinds, seeds, cells, width and samples; leave these and plan out")
+        if plan or vary or not cells is width is samples is None:
+            raise ConfigError("split says cells, width and samples; leave these, plan and vary out")
         rooms = read_split(split)
-        jobs = list(_jobs_of(rooms, folder))
+        jobs = list(_jobs_of(rooms, folder, kind or [], seed_numbers(seeds) if seeds else None))
         how |= {"width": rooms.width, "samples": rooms.samples, "pictures": False}
         network_of |= {"layer": rooms.layer, "grid": rooms.grid and parse_grid(rooms.grid)}
         check_folder(folder.absolute(), "the folder of the rooms")
