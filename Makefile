@@ -52,7 +52,7 @@ typecheck: $(STAMP)  ## mypy
 	$(BIN)/mypy
 
 test: lint typecheck $(RENDER)  ## lint, type-check, all tests and doctests
-	$(BIN)/python -m pytest -n 2 --dist worksteal -q
+	$(BIN)/python -m pytest -n 2 --dist worksteal -q --durations=25
 
 faults: $(STAMP)  ## the long form of the suites of faults, half an hour; writes docs/reliability.md
 	VUSFA_LONG=1 $(BIN)/python -m pytest -q tests/cluster/test_ray_train.py tests/faults/test_torchrun.py

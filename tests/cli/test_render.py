@@ -170,8 +170,8 @@ def test_the_rooms_of_a_split(
     few = ["render-rooms", tmp_path / "few", f"split={tmp_path / 'two.yaml'}"]
     assert run(*few, "seeds=2-9", "kind=[hall]").exit_code == 0
     assert [path.name for path in (tmp_path / "few").glob("*.h5")] == ["hall-3.h5"]
-    assert "split has no room of this kind and these seeds" in run(*few, "seeds=2").stderr
-    assert "no kind of room is called 'cellar'" in run(*few, "kind=[cellar]").stderr
+    assert "two.yaml: has no room of kind None and seeds ['2']" in run(*few, "seeds=2").stderr
+    assert "two.yaml: has no room of kind ['cellar']" in run(*few, "kind=[cellar]").stderr
     assert "is another split" in run("render-rooms", tmp_path / "rooms", "split=unseen").stderr
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -64,36 +64,28 @@ def _given(plan: Plan) -> Plan:
     return plan
 
 
+def _drawn(kind: str, seed: int, cells: int | None) -> Callable[[], Plan]:
+    """What draws a room; an unknown kind is an error now, before any work."""
+    from vusfa.sources.render.kinds import programme
+    from vusfa.sources.render.layout import layout
+
+    programme(kind)
+    return partial(layout, kind, seed, cells)
+
+
 def _jobs_of(split: RoomSplit, folder: Path, kinds: list[str], seeds: list[int] | None) -> Iterator[_Job]:
     """Rooms of a split; of these kinds and seeds alone where some are given."""
-    from vusfa.sources.render.layout import layout
     from vusfa.sources.render.variation import PLAIN
 
-    _check_kinds([*split.kinds, *kinds])
-    rooms = [
-        room
-        for part in split.parts
-        for room in split.rooms(part)
-        if (not kinds or room[0] in kinds) and (seeds is None or room[1] in seeds)
-    ]
-    if not rooms:
-        raise ConfigError("split has no room of this kind and these seeds; leave kind and seeds out for all")
-    for kind, seed, cells in rooms:
-        yield _Job(folder / f"{kind}-{seed}.h5", partial(layout, kind, seed, cells), PLAIN)
-
-
-def _check_kinds(kinds: Iterable[str]) -> None:
-    """An unknown kind is an error before any work."""
-    from vusfa.sources.render.kinds import programme
-
-    for kind in kinds:
-        programme(kind)
+    for part in split.parts:
+        for kind, seed, cells in split.rooms(part):
+            if (not kinds or kind in kinds) and (seeds is None or seed in seeds):
+                yield _Job(folder / f"{kind}-{seed}.h5", _drawn(kind, seed, cells), PLAIN)
 
 
 def _jobs(
     folder: Path, plans: list[Path], kinds: list[str], seeds: list[int], cells: int | None, vary: list[str]
 ) -> Iterator[_Job]:
-    from vusfa.sources.render.layout import layout
     from vusfa.sources.render.variation import PLAIN, load_variation
 
     for what, paths in (("plans", plans), ("changes", [Path(name) for name in vary])):
@@ -103,10 +95,9 @@ def _jobs(
     drawn: dict[str, Callable[[], Plan]] = {}
     for path in plans:
         drawn[path.stem] = partial(_given, find_plan(path))
-    _check_kinds(kinds)
     for seed in seeds:  # a stopped run has rooms of all kinds
         for kind in kinds:
-            drawn[f"{kind}-{seed}"] = partial(layout, kind, seed, cells)
+            drawn[f"{kind}-{seed}"] = _drawn(kind, seed, cells)
     for name, draw in drawn.items():
         for change, variation in changes.items():
             yield _Job(folder / change / f"{name}.h5", draw, variation)
@@ -211,6 +202,10 @@ def render_rooms(
             raise ConfigError("split says cells, width and samples; leave these, plan and vary out")
         rooms = read_split(split)
         jobs = list(_jobs_of(rooms, folder, kind or [], seed_numbers(seeds) if seeds else None))
+        if not jobs:
+            raise ConfigError(
+                f"{split}: has no room of kind {brief(kind)} and seeds {brief(seeds)}; see its parts"
+            )
         how |= {"width": rooms.width, "samples": rooms.samples, "pictures": False}
         network_of |= {"layer": rooms.layer, "grid": rooms.grid and parse_grid(rooms.grid)}
         check_folder(folder.absolute(), "the folder of the rooms")
