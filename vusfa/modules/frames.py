@@ -54,8 +54,8 @@ class FeatureFrames(_Frames):
             it.
 
     Attributes:
-        dropout: probability with which a feature that is looked up in training mode is 0, its mean with
-            ``normalize``; the others grow by 1 / (1 - dropout). Each look-up draws anew.
+        dropout: probability in 256ths with which a feature that is looked up in training mode is 0, its mean
+            with ``normalize``; the others grow by 1 / (1 - dropout). Each look-up draws anew.
 
     Raises:
         ConfigError: ``normalize``, and no feature changes at all.
@@ -103,9 +103,11 @@ class FeatureFrames(_Frames):
         found = self._found(ids)
         if not (self.dropout and self.training):
             return found
-        # torch.dropout draws from a Bernoulli distribution, which takes three times as long
-        kept = torch.rand_like(found) >= self.dropout
-        return found * kept / (1 - self.dropout)
+        # a byte per feature, eight to a draw: a number per feature takes five times as long
+        number, hidden = found.numel(), round(256 * self.dropout)
+        draws = torch.randint(-(2**63), 2**63 - 1, (-(-number // 8),), device=found.device)
+        kept = draws.view(torch.uint8)[:number].view(found.shape) >= hidden
+        return (found * kept).mul_(256 / (256 - hidden))
 
     def _found(self, ids: Tensor | None) -> Tensor:
         if self._rows is not None:

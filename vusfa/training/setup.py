@@ -84,8 +84,8 @@ def make_trainer(
     if ranks.size > 1:
         algorithm.share_statistics(ranks.mean)
     crop, dropout = task.pop("crop"), task.pop("crop_dropout", 0.0)
-    if not 0 <= dropout < 1:
-        raise ConfigError(f"env.crop_dropout is {dropout}; give a number from 0 to below 1")
+    if not 0 <= dropout <= 255 / 256:
+        raise ConfigError(f"env.crop_dropout is {dropout}; give a number from 0 to 255/256")
     if dropout and (agent.config["observation"], agent.config["encoder"]) != ("index", "mlp"):
         raise ConfigError(
             f"env.crop_dropout is {dropout}: only an agent that looks features up by ids sees it; give 0"
