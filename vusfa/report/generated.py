@@ -93,6 +93,7 @@ def documents(results: str | Path) -> dict[str, str]:
     lengths, differences = transfer_tables(read_runs(results, "transfer"), world)
     texts |= {"transfer.md": lengths, "transfer-differences.md": differences}
     texts["generalise.md"] = unseen_table(read_runs(results, "generalise"))
+    texts["robustness.md"] = robustness_table(read_runs(results, "robustness"))
     texts["robustness-one-room.md"] = robustness_table(read_runs(Path(results) / "one-room", "robustness"))
     return {name: f"<!-- {COMMAND} -->\n\n{text}\n" for name, text in texts.items()}
 
